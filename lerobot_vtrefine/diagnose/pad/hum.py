@@ -30,37 +30,60 @@ def hum(
     if presses.layout.num_taxels < 2:
         return []
     times = [press.trial.time_s for press in presses.presses]
-    even, loads = patterns(fitted, weights)
-    shared = (("errors of all taxels hum", even), ("errors of loaded taxels hum, in proportion,", loads))
-    return [_line(text, times, residuals, pattern, weights, seed) for text, pattern in shared]
+    lines = np.arange(0.0, HIGHEST_HZ, 0.5 / float(np.median([np.ptp(time) for time in times])))
+    shapes = patterns(fitted, weights)
+    signs, products = _shared(lines, times, residuals, shapes, weights, seed)
+    texts = ("errors of all taxels hum", "errors of loaded taxels hum, in proportion,")
+    parts = zip(texts, shapes, products, strict=True)
+    return [
+        _line(text, lines, times, residuals, pattern, weights, signs, product)
+        for text, pattern, product in parts
+    ]
+
+
+def _shared(
+    lines: Array,
+    times: Sequence[Array],
+    residuals: Sequence[Array],
+    shapes: Sequence[Sequence[Array]],
+    weights: Sequence[TrialWeights],
+    seed: int,
+) -> tuple[Array, list[list[Array]]]:
+    """What groups of taxels have in common at every frequency, if errors follow any of some patterns.
+
+    Noise is each taxel's own: what groups of them have in common at a frequency is as likely of either sign.
+
+    Returns the drawn signs of pairs of groups (B, K*Q), and of every pattern and press their products (F, Q).
+    """
+    rng = np.random.default_rng([seed, 11])
+    one, other = np.triu_indices(GROUPS, 1)
+    pairs: list[Array] = []
+    products: list[list[Array]] = [[] for _ in shapes]
+    for time, residual, weight, *alongs in zip(times, residuals, weights, *shapes, strict=True):
+        group = rng.permutation(residual.shape[1])[:, None] % GROUPS == np.arange(GROUPS)
+        signs = 2.0 * rng.integers(0, 2, (FLIPS + 1, GROUPS)) - 1.0
+        signs[0] = 1.0
+        pairs.append(signs[:, one] * signs[:, other])
+        wave, white = _wave(lines, time), weight.memory.white(residual / weight.sigma)
+        for found, along in zip(products, alongs, strict=True):
+            sums = wave @ (_level(white * along) @ group)
+            product = (sums[:, one] * sums[:, other].conj()).real
+            found.append(product / max(float((along**2).sum()), 1e-12))
+    return np.hstack(pairs).astype(np.float32), products
 
 
 def _line(
     text: str,
+    lines: Array,
     times: Sequence[Array],
     residuals: Sequence[Array],
     pattern: Sequence[Array],
     weights: Sequence[TrialWeights],
-    seed: int,
+    signs: Array,
+    products: Sequence[Array],
 ) -> Suspicion:
-    """The strongest line of what would be shared (T, n) in units of noise.
-
-    Noise is each taxel's own: what groups of them have in common at a frequency is as likely of either sign.
-    """
-    lines = np.arange(0.0, HIGHEST_HZ, 0.5 / float(np.median([np.ptp(time) for time in times])))
-    rng = np.random.default_rng([seed, 11])
-    one, other = np.triu_indices(GROUPS, 1)
-    products, pairs = [], []
-    for time, residual, along, weight in zip(times, residuals, pattern, weights, strict=True):
-        errors = _level(weight.memory.white(residual / weight.sigma) * along)
-        group = rng.permutation(errors.shape[1])[:, None] % GROUPS == np.arange(GROUPS)
-        sums = _wave(lines, time) @ (errors @ group)
-        product = (sums[:, one] * sums[:, other].conj()).real
-        products.append(product / max(float((along**2).sum()), 1e-12))
-        signs = 2.0 * rng.integers(0, 2, (FLIPS + 1, GROUPS)) - 1.0
-        signs[0] = 1.0
-        pairs.append(signs[:, one] * signs[:, other])
-    drawn = np.hstack(pairs).astype(np.float32) @ np.hstack(products).astype(np.float32).T
+    """The strongest line of what would be shared (T, n) in units of noise."""
+    drawn = signs @ np.hstack(products).astype(np.float32).T
     _count_beyond_slow_ones(drawn, lines, times)
     best = int(drawn[0].argmax())
     scores = np.array([product[best].sum() for product in products])
