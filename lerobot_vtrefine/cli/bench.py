@@ -35,6 +35,7 @@ PARTS = {
     "tactile": "lerobot_vtrefine.tactile.benchmark",
     "envs": "lerobot_vtrefine.envs.benchmark",
     "dataset": "lerobot_vtrefine.lerobot_compat.benchmark",
+    "diagnose": "lerobot_vtrefine.diagnose.pad.benchmark",
     "finetune": "lerobot_vtrefine.finetune.benchmark",
     "drivers": "lerobot_vtrefine.drivers.benchmark",
     "busy": "lerobot_vtrefine.finetune.benchmark_busy",

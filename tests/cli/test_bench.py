@@ -126,4 +126,5 @@ def test_plot_writes_a_picture_and_a_table(
 def test_unknown_part(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     monkeypatch.setattr(sys, "argv", ["vtrefine-bench", "--parts=[physics]"])
     assert bench.main() == 2
-    assert "unknown physics; choose from tactile, envs, dataset, finetune, drivers" in capsys.readouterr().err
+    choices = "tactile, envs, dataset, diagnose, finetune, drivers"
+    assert f"unknown physics; choose from {choices}" in capsys.readouterr().err
