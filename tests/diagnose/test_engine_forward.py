@@ -11,7 +11,7 @@ from lerobot_vtrefine.diagnose.pad.baseline import describe, plain_weights
 from lerobot_vtrefine.diagnose.pad.candidates import CATALOGUE
 from lerobot_vtrefine.diagnose.pad.candidates.base import Form
 from lerobot_vtrefine.diagnose.pad.fitting import fit, grows_with_gain, predict, rest, scouted, tangents
-from lerobot_vtrefine.diagnose.pad.forward_model import run
+from lerobot_vtrefine.diagnose.pad.forward_model import run, stages
 from lerobot_vtrefine.diagnose.pad.forward_model.run import LoweredBench, run_stages
 from lerobot_vtrefine.diagnose.pad.model import Composite, sensor_model
 from lerobot_vtrefine.diagnose.pad.prediction import predict_trial
@@ -117,6 +117,27 @@ def test_loops_of_other_fractions_have_the_same_memories(monkeypatch: pytest.Mon
     monkeypatch.setattr(hysteresis, "kept_between", lambda *bounds: found.append(1) or plain(*bounds))
     tangents(model, held, np.arange(2, 6))
     assert len(found) == 4 * len(held.bench.sheets("bent"))
+
+
+def test_slow_springs_of_other_fractions_have_the_same_memories(monkeypatch: pytest.MonkeyPatch) -> None:
+    held, found, plain = presses(), [], stages.low_passed
+    form = next(form for form in CATALOGUE if form.family == "viscoelastic_relaxation")
+    model = composite(held).plus(form, np.array([0.1, 0.0]))
+    monkeypatch.setattr(stages, "low_passed", lambda *args: found.append(1) or plain(*args))
+    tangents(model, held, np.array([2]))
+    assert len(found) == len(held.presses)
+
+
+def test_every_drift_is_worked_out_once_and_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    held, found, plain = presses(), [], stages._drifted
+    form = next(form for form in CATALOGUE if form.family == "baseline_drift")
+    monkeypatch.setattr(stages, "_drifted", lambda *args: found.append(1) or plain(*args))
+    for counts in (30.0, -20.0, -20.0):
+        model = composite(held).plus(form, np.array([counts]))
+        alone = predict(model, replace(held))
+        for known, anew in zip(predict(model, held), alone, strict=True):
+            assert np.array_equal(known, anew)
+    assert len(found) == 2 + 3
 
 
 def test_a_fit_needs_tangents_once_for_every_step(monkeypatch: pytest.MonkeyPatch) -> None:
