@@ -49,6 +49,14 @@ class Rig:
     latency_s: float = 0.0
     latency_spread: float = 0.0
     """Standard deviation of single commands' delays, as a part of their mean (gamma distributed)."""
+    own_latency: dict = field(default_factory=dict)
+    """Joint -> delay of its own [s], beside that of all."""
+    filter_s: float = 0.0
+    """Time constant of a low-pass through which commands reach the joints."""
+    lost_every: int = 0
+    """Every so many-th command never comes; 0: all come."""
+    counts_every: int = 0
+    """Only every so many-th command comes; 0: all do."""
     friction: dict = field(default_factory=dict)
     """As servo error [rad]."""
     stribeck: float = 0.0
@@ -173,6 +181,15 @@ class Robot:
                 target = target + size * np.roll(v, 1, axis=1) ** 2
         return target
 
+    def wanted(self, arrival, command, then, h):
+        """Mean command in force from `then` to `then + h`; joints may be later than all are."""
+        own = column(self.rig, self.rig.own_latency)
+        out = np.empty((len(arrival), len(own)))
+        for late in np.unique(own):
+            same = own == late
+            out[:, same] = self.late(arrival + late, command[..., same], then, h)
+        return out
+
     def late(self, arrival, command, then, h):
         """Mean command in force from `then` to `then + h`: one that arrives inside counts for its part."""
         everyone = np.arange(len(arrival))
@@ -192,7 +209,7 @@ class Robot:
         pull = pull * (1 + rig.servo_scatter * rng.normal(size=(len(t), 1)))
         frames = t.shape[1]
         q = command[:, 0] + self.sag_of(command[:, 0])
-        v, slack = np.zeros_like(q), command[:, 0].copy()
+        v, slack, smooth = np.zeros_like(q), command[:, 0].copy(), command[:, 0].copy()
         out, torque = np.empty_like(command), np.zeros_like(command)
         steps = max(1, round(np.median(np.diff(t)) / 1e-3))
         for k in range(frames):
@@ -203,8 +220,12 @@ class Robot:
             for step in range(steps):
                 now = t[:, k] + step * h
                 u = command[:, k]
-                if rig.latency_s:
-                    u = self.late(arrival[:, : k + 1], command, now, h)
+                if rig.latency_s or rig.own_latency:
+                    u = self.wanted(arrival[:, : k + 1], command[:, : k + 1], now, h)
+                if rig.filter_s:
+                    ahead, fade = u - smooth, np.exp(-h / rig.filter_s)[:, None]
+                    smooth = u - fade * ahead
+                    u = u - (1 - fade) * (rig.filter_s / h)[:, None] * ahead
                 slack = np.clip(slack, u - half, u + half)
                 part = step / steps if rig.compliance_form == "between" else 0.0
                 force_n = (1 - part) * load_n[:, k] + part * load_n[:, k + 1]
@@ -242,7 +263,13 @@ def arrivals(rig, rng, t):
 
 
 def lossy(rig, rng, command):
-    """Commands (T, N, J) of which now and then a few in a row never come."""
+    """Commands (T, N, J) of which now and then a few in a row never come, or some in a rhythm."""
+    if rig.lost_every:
+        frame = np.arange(command.shape[1])
+        return command[:, frame - (frame % rig.lost_every == rig.lost_every - 1)]
+    if rig.counts_every:
+        frame = np.arange(command.shape[1])
+        return command[:, frame - frame % rig.counts_every]
     if "packet_loss" not in rig.unknown:
         return command
     lost = rng.random(command.shape[:2]) < 1 / 45

@@ -10,7 +10,7 @@ import numpy as np
 
 from lerobot_vtrefine.diagnose.core.normal_equations import solved
 from lerobot_vtrefine.diagnose.joints.batch import frame_s
-from lerobot_vtrefine.diagnose.joints.parameters import INDEX, PARAMETERS, POSITIVE, RATIOS, SAG
+from lerobot_vtrefine.diagnose.joints.parameters import INDEX, PARAMETERS, POSITIVE, RATIOS, SAG, TIMES
 from lerobot_vtrefine.diagnose.joints.servo_trials import Point, ServoTrials
 from lerobot_vtrefine.diagnose.joints.stages import STAGES
 
@@ -21,7 +21,7 @@ ZETA_BOUNDS = (0.1, 20.0)
 _RADIANS_PER_FRAME = (6.0, 3.0)
 """Fastest servo that frames can tell, well damped and swinging: beyond, oscillations alias."""
 TAU_BOUND_S = 1.0
-_LARGEST = {"round": 1.0, "stick": 3.0}
+_LARGEST = {"round": 1.0, "stick": 3.0} | dict.fromkeys(TIMES, TAU_BOUND_S)
 _TOLERANCE = 1e-5
 _RIDGE = (1e-4, 3e-3)  # where commands are repeated, and where nothing tells misfit from sag
 _LEAST_DAMPING = 1e-9
@@ -232,6 +232,8 @@ def derivatives(problem: ServoTrials, now: Fit) -> Derivatives:
     theta = now.point.theta[joint].copy()
     steps = np.where(parameter < 2, 1e-3, 0.02 * problem.scale[joint])
     steps = np.where(np.isin(parameter, [INDEX[name] for name in RATIOS]), 0.02, steps)
+    step_s = 0.05 * frame_s(problem.batch)
+    steps = np.where(np.isin(parameter, [INDEX[name] for name in TIMES]), step_s, steps)
     theta[np.arange(len(joint)), parameter] += steps
     here = problem.batch.position - now.residual
     moved = problem.predict(now.point, joint, theta) - here[..., joint]
@@ -239,9 +241,8 @@ def derivatives(problem: ServoTrials, now: Fit) -> Derivatives:
     columns = {index: moved[..., joint == index] for index in range(problem.batch.joints)}
     tau = None
     if now.tau_free:
-        step = 0.05 * frame_s(problem.batch)
-        later = problem.predict(replace(now.point, tau_s=now.point.tau_s + step))
-        tau = np.where(problem.batch.valid[..., None], later - here, 0.0) / step
+        later = problem.predict(replace(now.point, tau_s=now.point.tau_s + step_s))
+        tau = np.where(problem.batch.valid[..., None], later - here, 0.0) / step_s
     return Derivatives(columns, tau)
 
 

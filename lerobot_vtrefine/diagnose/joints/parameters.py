@@ -8,6 +8,8 @@ _SHAPES = ("round", "stick")
 RATIOS = (*_SHAPES, *(name for stage in stages.STAGES for name in stage.ratios))
 """Numbers without a unit, of the order of one."""
 _SERVO = ("log_omega", "log_zeta", "offset", "play", "loose", "friction")
-PARAMETERS = (*_SERVO, *SAG, "bend", "stop", "give", *_SHAPES, *stages.parameters())
+TIMES = ("late", "filtered")
+"""Of one joint [s]: how much later its commands come than all do, and the time constant of their low-pass."""
+PARAMETERS = (*_SERVO, *SAG, "bend", "stop", "give", *_SHAPES, *TIMES, *stages.parameters())
 INDEX = {name: place for place, name in enumerate(PARAMETERS)}
-POSITIVE = ("play", "loose", "friction", "stop", *_SHAPES)
+POSITIVE = ("play", "loose", "friction", "stop", *_SHAPES, *TIMES)

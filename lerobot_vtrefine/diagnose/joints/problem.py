@@ -10,11 +10,12 @@ from lerobot_vtrefine.diagnose.core.problem import OptionalSteps
 from lerobot_vtrefine.diagnose.core.rivals import Rival
 from lerobot_vtrefine.diagnose.core.rules import LEAST_GAIN, RESOLVED
 from lerobot_vtrefine.diagnose.core.search import ALL, Selection
-from lerobot_vtrefine.diagnose.core.suspicion import Suspicion
+from lerobot_vtrefine.diagnose.core.suspicion import Suspicion, confirmed
 from lerobot_vtrefine.diagnose.joints import gravity
 from lerobot_vtrefine.diagnose.joints.candidates import CATALOGUE, told_by_load
 from lerobot_vtrefine.diagnose.joints.candidates.base import Candidate
 from lerobot_vtrefine.diagnose.joints.fitting import Fit, evaluate, fit, refit, servo_only
+from lerobot_vtrefine.diagnose.joints.lags import lags
 from lerobot_vtrefine.diagnose.joints.newton import Refits, refits
 from lerobot_vtrefine.diagnose.joints.parameters import INDEX, SAG
 from lerobot_vtrefine.diagnose.joints.rules import EXTRAPOLATION, LEAST_EFFECT_M, LEAST_EFFECT_RAD
@@ -185,5 +186,7 @@ class JointProblem(ServoTrials, OptionalSteps):
         return load_prefers(self, rival.fit, selection.fit, rival.channels[0], seed)
 
     def suspicions(self, selection: Selection[Any, Fit, Candidate], seed: int) -> list[Suspicion]:
-        """See `joints.suspicions`."""
-        return suspicions(selection)
+        """See `joints.suspicions`; and `joints.lags` where a delay has a name, or anything is left."""
+        found = suspicions(selection)
+        asked = ALL in selection.chosen or confirmed(found, seed)
+        return [*found, *(lags(selection, seed) if asked else ())]

@@ -52,6 +52,8 @@ FEWEST_TRIALS, SESSION_TREND = 6, 0.1
 explain."""
 RINGS = 0.1
 """Part of what is left that must be in one line of its spectrum."""
+CREEPS = 0.95
+"""Damping ratio from which on a servo fades as two low-passes do: a third is told from neither."""
 STANDS_STILL = 0.4
 """Part of the baseline's squared error in frames where a gripper stands far from its command."""
 

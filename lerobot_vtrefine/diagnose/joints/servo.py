@@ -1,7 +1,7 @@
 """The joints' servo model: second-order response to zero-order-held commands, and what real joints add to it.
 
 A joint's target r is its command, late by tau, through play of full width `play`, plus `push` (gravity's sag,
-what a load bends). The servo follows:
+what a load bends), and may pass a low-pass of the first order. The servo follows:
 
     q'' = omega^2 (r - friction sign(q') - q) - 2 zeta omega q'          (friction as servo error, [rad])
 
@@ -32,6 +32,8 @@ _SPREAD = (-0.8, -0.4, 0.0, 0.4, 0.8)
 """Middles of five equal parts of a spread of widths."""
 _DT_DIGITS = 6
 _LEAST_MEAN_S = 1e-4
+_SHORTEST_S = 1e-6
+"""A low-pass that is faster passes everything."""
 
 
 @dataclass(frozen=True)
@@ -61,17 +63,21 @@ class Columns:
     """By what part breaking away takes more than friction in motion."""
     tau_s: float = 0.0
     """Every command acts this late."""
+    late: Array | None = None
+    """By how much more the commands of one joint do [s]."""
+    filtered: Array | None = None
+    """Time constant of the low-pass before the servo [s]."""
     push: Array | None = None
     """(N, T, C) added to the target."""
     stages: Mapping[str, Array] | None = None
     """Values (C,) of `stages.parameters`."""
 
-    def only(self, kind: Array) -> "Columns":
-        """The servo's parameters of some columns."""
-        names = ("joint", "omega", "zeta", "offset", "play", "loose", "friction")
-        own = {name: getattr(self, name)[kind] for name in names}
-        stick = None if self.stick is None else self.stick[kind]
-        return replace(self, **own, stop=None, give=None, push=None, stages=None, rounding=None, stick=stick)
+    def only(self, kind: Array, tau_s: float) -> "Columns":
+        """The servo's parameters of some columns, whose commands act that late."""
+        names = ("joint", "omega", "zeta", "offset", "play", "loose", "friction", "stick", "filtered")
+        own = {name: None if (all_ := getattr(self, name)) is None else all_[kind] for name in names}
+        none = dict.fromkeys(("stop", "give", "push", "stages", "rounding", "late"))
+        return replace(self, **own, **none, tau_s=tau_s)
 
 
 def two_delays(mean_s: float, spread_s: float) -> tuple[tuple[float, float], tuple[float, float]]:
@@ -95,10 +101,11 @@ def simulate(batch: Batch, columns: Columns) -> Array:
         target = applied("target", target, columns.stages, load)
     start = np.clip(target[0], first - columns.loose / 2, first + columns.loose / 2)
     dry = columns.friction > 0
+    delay = np.full(dry.shape, columns.tau_s) if columns.late is None else columns.tau_s + columns.late
     q = np.empty_like(target)
-    for kind, follow in ((~dry, _linear), (dry, _with_friction)):
-        if kind.any():
-            q[..., kind] = follow(batch.time_s, target[..., kind], start[:, kind], columns.only(kind))
+    for tau_s, rubs in sorted(set(zip(delay.tolist(), dry.tolist(), strict=True))):
+        kind, follow = (delay == tau_s) & (dry == rubs), _with_friction if rubs else _linear
+        q[..., kind] = follow(batch.time_s, target[..., kind], start[:, kind], columns.only(kind, tau_s))
     if (columns.loose > 0).any():
         q = _worn(q, columns.loose, columns.rounding, first)
     if columns.stages is not None:
@@ -180,22 +187,42 @@ def _linear(time_s: Array, target: Array, start: Array, columns: Columns) -> Arr
     unique, inverse = np.unique(dt.round(_DT_DIGITS), return_inverse=True)
     inverse = inverse.reshape(dt.shape)
     a11, a12, a21, a22 = transition(unique[:, None], columns.omega, columns.zeta)
+    low_pass = _low_pass(unique[:, None], columns)
     held, extra = _arrivals(time_s, target, columns)
     out = np.empty_like(target)
-    q, v = start, np.zeros_like(start)
+    q, v, smooth = start, np.zeros_like(start), target[0]
     out[0] = q
     for k in range(len(dt)):
         step = inverse[k]
         error = q - held[k]
         q, v = held[k] + a11[step] * error + a12[step] * v, a21[step] * error + a22[step] * v
+        if low_pass is not None:
+            behind = smooth - held[k]
+            q, v = q + low_pass[0][step] * behind, v + low_pass[1][step] * behind
+            smooth = held[k] + low_pass[2][step] * behind
         if extra is not None:
-            q, v = q + extra[0][k], v + extra[1][k]
+            q, v, smooth = q + extra[0][k], v + extra[1][k], smooth + extra[2][k]
         out[k + 1] = q
     return out
 
 
-def _arrivals(time_s: Array, target: Array, columns: Columns) -> tuple[Array, tuple[Array, Array] | None]:
-    """Target in force at the start of every interval (N-1, T, C), and what later arrivals add by its end."""
+def _low_pass(h: Array, columns: Columns) -> tuple[Array, Array, Array] | None:
+    """What is left of a low-pass's distance from its target after time h: in q, in q', and of itself."""
+    if columns.filtered is None or not columns.filtered.any():
+        return None
+    omega, zeta = columns.omega, columns.zeta
+    rate = -1 / np.maximum(columns.filtered, _SHORTEST_S)
+    # A servo that fades exactly as its low-pass does is told by one that nearly does.
+    close = np.abs(rate**2 + 2 * zeta * omega * rate + omega**2) < _CRITICAL * omega**2
+    rate = np.where(close, (1 + _CRITICAL**0.5) * rate, rate)
+    a11, a12, a21, a22 = transition(h, omega, zeta)
+    fade, part = np.exp(rate * h), omega**2 / (rate**2 + 2 * zeta * omega * rate + omega**2)
+    return part * (fade - a11 - rate * a12), part * (rate * (fade - a22) - a21), fade
+
+
+def _arrivals(time_s: Array, target: Array, columns: Columns) -> tuple[Array, Array | None]:
+    """Target in force at the start of every interval (N-1, T, C), and what later arrivals add by its end to
+    the position, the speed and the low-pass (3, N-1, T, C)."""
     if columns.tau_s <= 0:
         return target[:-1], None
     count, trials = time_s.shape
@@ -213,15 +240,16 @@ def _arrivals(time_s: Array, target: Array, columns: Columns) -> tuple[Array, tu
     rest = time_s[row + 1, trial] - arrival[where + 1, trial]
     unique, inverse = np.unique(rest.round(_DT_DIGITS), return_inverse=True)
     b11, _, b21, _ = transition(unique[:, None], columns.omega, columns.zeta)
+    b13, b23, fade = _low_pass(unique[:, None], columns) or (0.0, 0.0, np.ones_like(b11))
     change = target[where + 1, trial] - target[where, trial]
-    extra = np.zeros((2, count - 1, *target.shape[1:]))
-    _add(extra[0], row, trial, (1 - b11)[inverse] * change)
-    _add(extra[1], row, trial, -b21[inverse] * change)
+    extra = np.zeros((3, count - 1, *target.shape[1:]))
+    for place, added in enumerate((1 - b11 - b13, -b21 - b23, 1 - fade)):
+        _add(extra[place], row, trial, added[inverse] * change)
     arrived = (arrival[1:] + lane).T.ravel()
     # Arrivals up to and at the interval's start are in force there.
     held = np.searchsorted(arrived, (time_s + lane).ravel(), side="right").reshape(count, trials)
     held = (held - np.arange(trials) * (count - 1)).clip(0, count - 1)
-    return np.take_along_axis(target, held[..., None], 0)[:-1], (extra[0], extra[1])
+    return np.take_along_axis(target, held[..., None], 0)[:-1], extra
 
 
 def _add(out: Array, row: Array, trial: Array, values: Array) -> None:
@@ -242,15 +270,20 @@ def _with_friction(time_s: Array, target: Array, start: Array, columns: Columns)
     unique, inverse = np.unique(step_s.round(_DT_DIGITS), return_inverse=True)
     inverse = inverse.reshape(step_s.shape)
     a11, a12, a21, a22 = transition(unique[:, None], columns.omega, columns.zeta)
+    low_pass = _fading(unique[:, None], columns)
     trials = np.arange(time_s.shape[1])
     path = np.empty((len(grid), *start.shape))
-    q, v = start.copy(), np.zeros_like(start)
+    q, v, smooth = start.copy(), np.zeros_like(start), target[0]
     path[0] = q
     friction = np.broadcast_to(columns.friction, q.shape)
     hold = np.broadcast_to(columns.friction * _breakaway(columns), q.shape)
     for k in range(len(step_s)):
         step = inverse[k]
         r = target[held[k], trials]
+        if low_pass is not None:
+            # Steps are short beside a low-pass that would show: its mean stands for it.
+            behind = smooth - r
+            r, smooth = r + low_pass[0][step] * behind, r + low_pass[1][step] * behind
         pull = r - q
         sign = np.sign(np.where(v == 0, pull, v))
         stuck = (v == 0) & (np.abs(pull) <= hold)
@@ -265,6 +298,15 @@ def _with_friction(time_s: Array, target: Array, start: Array, columns: Columns)
         q, v = np.where(stuck, q, moved), np.where(stuck, 0.0, speed)
         path[k + 1] = q
     return np.take_along_axis(path, frame[..., None], 0)
+
+
+def _fading(h: Array, columns: Columns) -> tuple[Array, Array] | None:
+    """What is left of a low-pass's distance from its target on the mean over time h, and at its end."""
+    if columns.filtered is None or not columns.filtered.any():
+        return None
+    time_s = np.maximum(columns.filtered, _SHORTEST_S)
+    fade = np.exp(-h / time_s)
+    return (1 - fade) * time_s / np.maximum(h, _SHORTEST_S), fade
 
 
 def _through_stop(

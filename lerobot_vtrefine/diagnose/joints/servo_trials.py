@@ -9,7 +9,7 @@ import numpy as np
 
 from lerobot_vtrefine.diagnose.joints import gravity, stages
 from lerobot_vtrefine.diagnose.joints.batch import Batch
-from lerobot_vtrefine.diagnose.joints.parameters import INDEX, PARAMETERS, SAG
+from lerobot_vtrefine.diagnose.joints.parameters import INDEX, PARAMETERS, SAG, TIMES
 from lerobot_vtrefine.diagnose.joints.servo import Columns, simulate, two_delays
 
 Array = np.ndarray
@@ -126,7 +126,7 @@ class ServoTrials:
         joint = np.arange(self.batch.joints) if joint is None else joint
         theta = point.theta[joint] if theta is None else theta
         value = dict(zip(PARAMETERS, theta.T, strict=True))
-        plain = ("offset", "play", "loose", "friction", "stop", "give", "stick")
+        plain = ("offset", "play", "loose", "friction", "stop", "give", "stick", *TIMES)
         columns = Columns(
             joint=joint,
             omega=np.exp(value["log_omega"]),

@@ -56,11 +56,11 @@ def suspicions(selection: "Selected") -> list[Suspicion]:
     found += _through_the_session(selection)
     found += _following(selection)
     found += _ringing(selection)
-    least = _worth_speaking_of(selection)
+    least = worth_speaking_of(selection)
     return [replace(item, least=max(item.least, float(least[item.channel]))) for item in found]
 
 
-def _worth_speaking_of(selection: "Selected") -> Array:
+def worth_speaking_of(selection: "Selected") -> Array:
     """(J,) part of what is left that is: enough of the baseline's error, and more than encoders' steps."""
     problem, left = selection.problem, selection.fit.total.clip(1e-300)
     floor = max(LEAST_EFFECT_RAD, problem.floor)
@@ -123,7 +123,7 @@ def _far(selection: "Selected", seen: Scatter, white: Array, clue: str) -> list[
     zeros = seen.zero > ZEROS_DIFFER * white
     # What differs in shape has a mean and a likeness to slower servos, too.
     servos, zeros = servos & (seen.servo_effect > seen.shape), zeros & (seen.zero > seen.shape)
-    least, total = _worth_speaking_of(selection), selection.fit.total.clip(1e-300)
+    least, total = worth_speaking_of(selection), selection.fit.total.clip(1e-300)
     found = []
     for joint in range(len(total)):
         for size, far in ((seen.shape, shapes), (seen.servo_effect, servos), (seen.zero, zeros)):

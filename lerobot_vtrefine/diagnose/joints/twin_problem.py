@@ -19,14 +19,16 @@ import mujoco
 import numpy as np
 from mujoco.batch import Batch as Worlds
 
+from lerobot_vtrefine.diagnose.core.suspicion import Suspicion
 from lerobot_vtrefine.diagnose.joints import gravity
 from lerobot_vtrefine.diagnose.joints.batch import Batch, frame_s
 from lerobot_vtrefine.diagnose.joints.candidates import CATALOGUE
 from lerobot_vtrefine.diagnose.joints.candidates.base import Candidate
 from lerobot_vtrefine.diagnose.joints.parameters import INDEX, PARAMETERS, SAG
-from lerobot_vtrefine.diagnose.joints.problem import JointProblem
+from lerobot_vtrefine.diagnose.joints.problem import JointProblem, Selected
 from lerobot_vtrefine.diagnose.joints.servo import play_operator
 from lerobot_vtrefine.diagnose.joints.servo_trials import Point
+from lerobot_vtrefine.diagnose.joints.suspicions import suspicions
 from lerobot_vtrefine.embodiments import get_embodiment
 from lerobot_vtrefine.sim import task
 from lerobot_vtrefine.sim.backends.batch import usable_cores
@@ -111,6 +113,11 @@ class TwinProblem(JointProblem):
         """Replays are slow: one form of each cause, and the decoys that are not forms of it."""
         known, forms = {"offset", "play", "friction", *SAG}, (None, "mass", "gain", "drift")
         return tuple(item for item in CATALOGUE if set(item.parameters) <= known and item.form in forms)
+
+    @override
+    def suspicions(self, selection: Selected, seed: int) -> list[Suspicion]:
+        """Replays know one delay of all commands: neither low-passes nor delays of single joints."""
+        return suspicions(selection)
 
     @override
     def with_one_delay(self, point: Point, joint: Array | None = None, theta: Array | None = None) -> Array:

@@ -26,10 +26,14 @@ FORMS = (
 def sizes(estimates: Estimates, joints: tuple[int, ...]) -> dict[str, Parameter]:
     """One delay of all joints, or the mean of those of single commands."""
     problem, value = estimates.selection.problem, estimates.selection.fit.point.tau_s
-    # A uniform error of width w has the standard deviation w / sqrt(12).
-    tick = 1.96 * SERVO_TICK_S / np.sqrt(12)
     method = estimates.method_error(METHOD, value)
     # Delays that scatter by nobody knows how much have shifted the mean by about as much.
     unsmeared = 0.0 if problem.scatter_s else problem.delay_spread_s
-    own = float(np.hypot(np.hypot(tick, unsmeared), method))
+    own = float(np.hypot(np.hypot(tick_s(), unsmeared), method))
     return {"tau_s": Parameter(value, widened(jackknife(estimates.tau, value), value, own), "s")}
+
+
+def tick_s() -> float:
+    """95 % half-width of when servos look at their commands, and encoders are read [s]."""
+    # A uniform error of width w has the standard deviation w / sqrt(12).
+    return float(1.96 * SERVO_TICK_S / np.sqrt(12))
