@@ -22,7 +22,7 @@ import draccus
 from lerobot_vtrefine.choices import check_choice
 from lerobot_vtrefine.cli.errors import run_cli
 from lerobot_vtrefine.cli.outputs import check_file
-from lerobot_vtrefine.cli.pipeline.stages import last_line, stop
+from lerobot_vtrefine.cli.pipeline.stages import end, last_line
 from lerobot_vtrefine.extras import SIMULATOR, require
 from lerobot_vtrefine.sim.config import WARP_SOLVERS, WarpConfig
 from lerobot_vtrefine.wording import plural
@@ -155,7 +155,7 @@ def measure_part(part: str, limit_s: float | None, arguments: dict[str, float]) 
             raise TimeoutError(f"not finished after {limit_s:g} s, skipped; --limit_s allows more") from None
         finally:
             if child.poll() is None:
-                stop(child)
+                end(child)
         if status:
             raise ChildProcessError(f"failed with status {status}: {last_line(log)}")
         return [Row(part, *row) for row in json.loads(result.read_text(encoding="utf-8"))]

@@ -12,6 +12,7 @@ import pytest
 
 from lerobot_vtrefine.cli.pipeline.stages import QUIET_S, STOPPING
 
+SCRIPTS = Path(__file__).parents[2] / "scripts"
 DEMO = """
 import sys
 from pathlib import Path
@@ -134,6 +135,7 @@ def begin(code: str, folder: Path, *arguments: str, takes_s: float) -> subproces
         stderr=subprocess.PIPE,
         stdout=subprocess.DEVNULL,
         text=True,
+        env=os.environ | {"PYTHONPATH": str(SCRIPTS)},
     )
 
 

@@ -49,6 +49,7 @@ def run_slowly(
 ) -> None:
     """In a child: the command, until a signal ends it; what it says goes to the log."""
     signal.signal(signal.SIGINT, signal.default_int_handler)  # a job in the background hears less
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)  # another command's, in this process, may be another
     os.environ.update(environment)
     sys.stderr = log.open("w", buffering=1)
     os.dup2(sys.stderr.fileno(), 2)

@@ -242,6 +242,11 @@ def stop(*children: subprocess.Popen[bytes]) -> None:
         if not _have_ended(children, QUIET_S):
             print(STOPPING, file=sys.stderr)
             _have_ended(children, PATIENCE_S)
+    end(*children)
+
+
+def end(*children: subprocess.Popen[bytes]) -> None:
+    """Ask children and their workers to end as Ctrl-C does, and end them if they do not at once."""
     with contextlib.suppress(KeyboardInterrupt):
         if not _have_ended(children, 0.0):
             _signal(children, signal.SIGINT)
