@@ -276,7 +276,7 @@ class WarpConfig:
     """Contacts, and pairs of geoms close to each other, on average over the worlds."""
     convex_per_world: int = 32
     """Contacts for the general collision of convex shapes (parts of meshes, cylinders in their holes), on
-    average over the worlds: each takes 8 kB, most of what a world needs."""
+    average over the worlds: each takes 8 kB, most of what a world needs. A few worlds have more of both."""
     rows_per_world: int = 384
     """Rows of constraints in any one world: 4 per contact, of which a round plug on the rim makes 84."""
     solver: str = "own"

@@ -26,6 +26,8 @@ from lerobot_vtrefine.sim.scene import build_scene
 from lerobot_vtrefine.sim.simulation import FAILURES, InsertionSim
 
 pytest.importorskip("mujoco_warp")
+from lerobot_vtrefine.sim.backends import warp_worlds
+
 pytestmark = pytest.mark.timeout(900)  # whichever test comes first compiles everything
 
 WORLDS = 3
@@ -211,11 +213,12 @@ def test_every_world_has_its_own_parameters():
 @pytest.mark.parametrize(
     ("sizes", "message"),
     [
-        ({"contacts_per_world": 10}, r"room for .*lost contacts.*raise warp.contacts_per_world \(now 10\)"),
-        ({"rows_per_world": 40}, r"constraint rows.*lost contacts.*raise warp.rows_per_world \(now 40\)"),
+        ({"contacts_per_world": 10}, r"room for .*raise --env.warp.contacts_per_world \(now 10\)"),
+        ({"rows_per_world": 40}, r"constraint rows and .*raise --env.warp.rows_per_world \(now 40\)"),
     ],
 )
-def test_a_buffer_too_small_for_the_contacts_is_told_once(pair, sizes, message, caplog):
+def test_a_buffer_too_small_for_the_contacts_is_told_once(pair, sizes, message, caplog, monkeypatch):
+    monkeypatch.setattr(warp_worlds, "SHARED", {})
     _, single = pair
     single.reset(EVERYONE, EVERYONE)
     backend = get_backend("warp", single.scene.model, 2, warp=WarpConfig(device="cpu", **sizes))
@@ -262,22 +265,33 @@ def test_a_world_without_room_for_its_collision_fails_alone(pair, monkeypatch):
     assert not warp.step(warp.command_targets()).terminated.any()
 
 
-def test_too_little_room_for_convex_contacts_is_told(pair, caplog):
-    """A round plug that is pushed into the wall of its hole touches it in several places."""
+def test_few_worlds_have_room_for_what_one_needs_at_its_worst(pair, caplog, monkeypatch):
+    """A round plug that is pushed into the wall of its hole touches it in several places: more than what is
+    given to worlds on average. Where there is no room, that is told.
+    """
     _, single = pair
     single.reset(EVERYONE, EVERYONE)
     seated(single)
     ids = np.arange(2)
     qpos, qvel = single._backend.read(ids)
     qpos[:, single.scene.model.joint("plug").qposadr[0]] += 0.002
-    for room, lost in ((32, False), (1, True)):
-        config = WarpConfig(device="cpu", convex_per_world=room)
+    for shared, lost in ((warp_worlds.SHARED, False), ({}, True)):
+        monkeypatch.setattr(warp_worlds, "SHARED", shared)
+        config = WarpConfig(device="cpu", convex_per_world=1)
         backend = get_backend("warp", single.scene.model, 2, warp=config)
         backend.write(ids, qpos, qvel)
         backend.advance(ids, np.repeat(single._episode.command[:2, None], 1, 1))
         assert backend.overflowed(ids).any() == lost
     (told,) = (record.getMessage() for record in caplog.records)
-    assert re.search(r"contacts of convex shapes .*raise warp.convex_per_world \(now 1\)", told)
+    assert re.search(r"contacts of convex shapes .*raise --env.warp.convex_per_world \(now 1\)", told)
+
+
+def test_the_least_room_is_shared_by_few_worlds_and_nothing_to_many():
+    few, many = (warp_worlds.with_shared_room(CPU, worlds) for worlds in (3, 1024))
+    for name, room in warp_worlds.SHARED.items():
+        assert 3 * (getattr(few, name) - 1) < room <= 3 * getattr(few, name)
+    assert few.rows_per_world == CPU.rows_per_world  # which each world has to itself
+    assert many == CPU
 
 
 def test_a_polytope_has_room_for_all_its_edges(pair):
