@@ -47,7 +47,7 @@ COMPILING = "compiling kernels, once on this machine: a minute or two, about fou
 SHARED = {CONTACTS: 4096, CONVEX: 1024}
 """Least room that worlds share, however few: on average they need little, but each at its worst, and episodes
 that start together come to it together. Pushed down its bore, a pin of 00446 makes up to 631 contacts of 175
-pairs of pieces; six such worlds fit. All of it takes 9 MB.
+pairs of pieces; five such worlds fit. All of it takes 9 MB.
 """
 LEAST_ROWS = 3
 """Rows of constraints that a contact takes at least: no contact sensor can match more contacts than fit."""
