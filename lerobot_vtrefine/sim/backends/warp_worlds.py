@@ -17,6 +17,7 @@ import warp as wp
 from mujoco_warp._src import collision_convex as convex
 
 from lerobot_vtrefine.sim.backends import warp_kernels as kernels
+from lerobot_vtrefine.sim.backends.warp_edges import try_both_edges
 from lerobot_vtrefine.sim.backends.warp_memory import Arena, Recording, record
 from lerobot_vtrefine.sim.backends.warp_step import WarpStep
 from lerobot_vtrefine.sim.config import WarpConfig
@@ -89,6 +90,7 @@ class WarpWorlds:
         with wp.ScopedDevice(self.device):
             self.model = mjw.put_model(_with_primitive_boxes(model))
             _set_options(self.model, config)
+            try_both_edges()
             _make_room_for_edges(model.opt.ccd_iterations)
             self.data = mjw.make_data(
                 model,
