@@ -1,10 +1,11 @@
-"""Ctrl-C, and SIGTERM, that wait for what must not be cut in two."""
+"""Ctrl-C, SIGTERM and SIGHUP: what must not be cut in two, and how a command ends."""
 
+import math
 import os
 import signal
 import threading
 import time
-from collections.abc import Generator
+from collections.abc import Callable, Generator
 from contextlib import contextmanager, suppress
 
 AGAIN_AFTER_S = 1.0
@@ -15,26 +16,73 @@ class Terminated(KeyboardInterrupt):
     """SIGTERM, by which schedulers ask a command to end; as Ctrl-C, but for the exit status."""
 
 
+class HungUp(KeyboardInterrupt):
+    """SIGHUP, which comes when the terminal is closed; likewise."""
+
+
+KINDS: dict[int, type[KeyboardInterrupt]] = {signal.SIGINT: KeyboardInterrupt, signal.SIGTERM: Terminated}
+if hasattr(signal, "SIGHUP"):  # not on Windows
+    KINDS[signal.SIGHUP] = HungUp
+
+
 def interruption(number: int) -> KeyboardInterrupt:
-    """What a signal that waited is raised as."""
-    return Terminated() if number == signal.SIGTERM else KeyboardInterrupt()
+    """What a signal is raised as."""
+    return KINDS[number]()
+
+
+def exit_status(stopped: KeyboardInterrupt) -> int:
+    """As shells have it: 128 and the signal's number."""
+    return 128 + next((number for number, kind in KINDS.items() if type(stopped) is kind), signal.SIGINT)
+
+
+@contextmanager
+def _handled(handler: Callable[[int, object], None], numbers: list[int]) -> Generator[None]:
+    """A handler of these signals within, the former ones afterwards."""
+    before = {number: signal.signal(number, handler) for number in numbers}
+    try:
+        yield
+    finally:
+        for number, former in before.items():
+            signal.signal(number, former)
 
 
 @contextmanager
 def interrupts_wait() -> Generator[None]:
-    """Ctrl-C within takes effect at the end; other threads than the main one never see it anyway."""
-    handler = signal.getsignal(signal.SIGINT)
-    if threading.current_thread() is not threading.main_thread() or not callable(handler):
+    """Signals within that a handler hears take effect at the end; only the main thread ever sees them."""
+    if threading.current_thread() is not threading.main_thread():
         yield
         return
-    came = []
-    signal.signal(signal.SIGINT, lambda *args: came.append(args))
+    came: list[int] = []
     try:
-        yield
+        handled = [number for number in KINDS if callable(signal.getsignal(number))]
+        with _handled(lambda number, _: came.append(number), handled):
+            yield
     finally:
-        signal.signal(signal.SIGINT, handler)
         if came:
-            handler(*came[0])
+            signal.raise_signal(came[0])
+
+
+@contextmanager
+def ends_like_ctrl_c() -> Generator[None]:
+    """SIGTERM and SIGHUP within are raised as Ctrl-C is; what is ignored, as by ``nohup``, stays so.
+
+    Shell and terminal both send SIGHUP: what comes sooner than AGAIN_AFTER_S is no second one. Other threads
+    than the main one change nothing.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    raised_s = -math.inf
+
+    def end(number: int, _: object) -> None:
+        nonlocal raised_s
+        if time.monotonic() - raised_s > AGAIN_AFTER_S:
+            raised_s = time.monotonic()
+            raise interruption(number)
+
+    heard = [number for number in KINDS if signal.getsignal(number) not in (signal.SIG_IGN, None)]
+    with _handled(end, [number for number in heard if number != signal.SIGINT]):
+        yield
 
 
 @contextmanager

@@ -29,9 +29,10 @@ from reality.lanes import Lanes, lanes, needed
 from reality.outcome import compare
 from reality.telling import as_text
 from runs.comparison import save
-from runs.side_by_side import run_all, run_script
+from runs.side_by_side import run_all
 
 from lerobot_vtrefine.cli.arguments import CommandParser
+from lerobot_vtrefine.cli.errors import run_cli
 from lerobot_vtrefine.cli.pipeline.demo_config import RECIPES, default_degradation
 from lerobot_vtrefine.cli.pipeline.stages import StageRunner
 from lerobot_vtrefine.cli.results.provenance import write_provenance
@@ -97,6 +98,7 @@ def parse() -> tuple[argparse.Namespace, Budget]:
     return options, Budget(**fields)
 
 
+@run_cli
 def main() -> None:
     """Prepare, run every policy, compare."""
     options, budget = parse()
@@ -132,4 +134,4 @@ def run_lanes(
 
 
 if __name__ == "__main__":
-    run_script(main)
+    raise SystemExit(main())

@@ -22,9 +22,10 @@ from typing import Any
 
 import yaml
 from runs.comparison import difference, effect, interval_text, over_seeds, rate_text, save
-from runs.side_by_side import run_all, run_script
+from runs.side_by_side import run_all
 
 from lerobot_vtrefine.cli.arguments import CommandParser
+from lerobot_vtrefine.cli.errors import run_cli
 from lerobot_vtrefine.cli.pipeline.demo_config import default_env
 from lerobot_vtrefine.shipped import PREFIX, encoders
 
@@ -157,6 +158,7 @@ def as_text(comparisons: dict[str, dict]) -> str:
     return "\n".join([*lines, "", *words])
 
 
+@run_cli
 def main() -> None:
     """Parse, run every pipeline, compare."""
     parser = CommandParser(description=__doc__)
@@ -193,4 +195,4 @@ def results_of(folders: dict[Run, Path], setting: str) -> dict[str, dict[int, di
 
 
 if __name__ == "__main__":
-    run_script(main)
+    raise SystemExit(main())

@@ -11,10 +11,11 @@ encoders; one that is there is not made again: remove the folder for that.
 """
 
 import json
-import subprocess
 import sys
 from pathlib import Path
 from typing import Any
+
+from runs.side_by_side import run_all
 
 from lerobot_vtrefine.cli.arguments import CommandParser
 from lerobot_vtrefine.cli.errors import run_cli
@@ -33,12 +34,11 @@ TURN = "plug_in_hand_rx"
 
 
 def study(task: str, folder: Path, extra: list[str]) -> None:
-    """Run the study of one task; one that fails ends this script with its status."""
+    """Run the study of one task."""
     command = [sys.executable, "-m", "lerobot_vtrefine.cli.information"]
     command += [f"--config_path=vtrefine:{task}", f"--output_dir={folder}", f"--effort.networks={NETWORKS}"]
     command += extra  # what is given twice counts the last time
-    if status := subprocess.run(command, check=False).returncode:
-        sys.exit(status)
+    run_all({folder: command}, jobs=1)
 
 
 def row(task: str, folder: Path) -> Line:

@@ -9,7 +9,6 @@ start, and the first quarter of the steps, do not count.
 
 import argparse
 import json
-import os
 import re
 import subprocess
 import sys
@@ -21,6 +20,7 @@ import numpy as np
 
 from lerobot_vtrefine.cli.arguments import CommandParser
 from lerobot_vtrefine.cli.errors import run_cli
+from lerobot_vtrefine.cli.pipeline.stages import end, own_sessions
 from lerobot_vtrefine.finetune.distributed import check_device
 from lerobot_vtrefine.lerobot_compat.benchmark import record_noise
 
@@ -53,10 +53,12 @@ def train(name: str, root: Path, args: argparse.Namespace) -> dict[str, Any]:
             *(f"--batch_size={args.batch_size}", f"--steps={args.steps}", f"--log_freq={log_freq}"),
             *(f"--num_workers={args.num_workers}", "--env_eval_freq=0"),
         ]
-        done = subprocess.run(command, capture_output=True, text=True, check=False, env=os.environ)
-    times = [[float(value) for value in found] for found in TIMES.findall(done.stdout + done.stderr)]
-    if done.returncode or not times:
-        raise ChildProcessError(f"lerobot-train failed: {(done.stderr or done.stdout)[-2000:]}")
+        with own_sessions(end) as start:
+            child = start(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+            said = str(child.communicate()[0])
+    times = [[float(value) for value in found] for found in TIMES.findall(said)]
+    if child.returncode or not times:
+        raise ChildProcessError(f"lerobot-train failed: {said[-2000:]}")
     update_s, data_s, samples_per_s = np.median(times[len(times) // 4 :], axis=0)
     return {
         "policy": name,

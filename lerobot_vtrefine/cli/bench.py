@@ -22,7 +22,7 @@ import draccus
 from lerobot_vtrefine.choices import check_choice
 from lerobot_vtrefine.cli.errors import run_cli
 from lerobot_vtrefine.cli.outputs import check_file
-from lerobot_vtrefine.cli.pipeline.stages import end, last_line
+from lerobot_vtrefine.cli.pipeline.stages import end, last_line, own_sessions
 from lerobot_vtrefine.extras import SIMULATOR, require
 from lerobot_vtrefine.sim.config import WARP_SOLVERS, WarpConfig
 from lerobot_vtrefine.wording import plural
@@ -140,22 +140,19 @@ def measure_part(part: str, limit_s: float | None, arguments: dict[str, float]) 
         require("it", SIMULATOR)
     with tempfile.TemporaryDirectory() as folder:
         result, log = Path(folder) / "rows.json", Path(folder) / "log"
-        with log.open("wb") as file:
-            child = subprocess.Popen(
+        with log.open("wb") as file, own_sessions(end) as start:
+            child = start(
                 # Unbuffered, or what it printed before it failed would follow its last words in the log.
                 [sys.executable, "-u", "-c", CHILD, PARTS[part], str(result), json.dumps(arguments)],
                 stdin=subprocess.DEVNULL,
                 stdout=file,
                 stderr=subprocess.STDOUT,
-                start_new_session=True,
             )
-        try:
-            status = child.wait(limit_s)
-        except subprocess.TimeoutExpired:
-            raise TimeoutError(f"not finished after {limit_s:g} s, skipped; --limit_s allows more") from None
-        finally:
-            if child.poll() is None:
-                end(child)
+            try:
+                status = child.wait(limit_s)
+            except subprocess.TimeoutExpired:
+                message = f"not finished after {limit_s:g} s, skipped; --limit_s allows more"
+                raise TimeoutError(message) from None
         if status:
             raise ChildProcessError(f"failed with status {status}: {last_line(log)}")
         return [Row(part, *row) for row in json.loads(result.read_text(encoding="utf-8"))]

@@ -12,7 +12,6 @@ other flags still change them.
 
 import json
 import logging
-import signal
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -87,7 +86,6 @@ def run_demo(config: DemoConfig) -> Path:
 @run_cli
 def main() -> None:
     """Console entry point."""
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
     path = run_demo(parse_config(sys.argv[1:]))
     print(f"report: {path}")
 

@@ -7,10 +7,11 @@ import functools
 import os
 import re
 import select
+import subprocess
 import sys
 from collections.abc import Callable, Generator, Iterable, Sequence
 from pathlib import Path
-from typing import NoReturn
+from typing import NoReturn, TextIO
 
 from draccus.utils import DraccusException
 from yaml import YAMLError
@@ -18,13 +19,11 @@ from yaml import YAMLError
 from lerobot_vtrefine.choices import did_you_mean
 from lerobot_vtrefine.extras import explain
 from lerobot_vtrefine.files import check_settings
-from lerobot_vtrefine.interrupts import Terminated
+from lerobot_vtrefine.interrupts import exit_status
 from lerobot_vtrefine.shipped import expand
 
 DEBUG_VARIABLE = "VTREFINE_DEBUG"
 USAGE_STATUS = 2
-INTERRUPT_STATUS = 130
-TERMINATED_STATUS = 143
 UNREAD_STATUS = 141
 """As a shell's tools end that write to ``head`` once it has seen enough."""
 
@@ -187,10 +186,10 @@ def after_interrupt(advice: str | Callable[[], str]) -> Generator[None]:
         raise type(stopped)(advice if isinstance(advice, str) else advice()) from None
 
 
-def _nobody_reads() -> bool:
-    """Whether standard output goes to a program that has ended; nothing more is written to it then."""
+def nobody_reads(stream: TextIO) -> bool:
+    """Whether it goes to a program that has ended or to a closed terminal; no more is written to it then."""
     try:
-        output = sys.stdout.fileno()
+        output = stream.fileno()
     except OSError:  # a notebook's
         return False
     if not hasattr(select, "poll"):  # Windows
@@ -208,9 +207,9 @@ def run_cli[**P](main: Callable[P, int | None]) -> Callable[P, int]:
 
     ``ValueError``, ``OSError`` (missing files, full disk), ``ImportError`` (an extra is not installed),
     ``FloatingPointError`` (training that diverged), draccus' parsing errors and a GPU without memory are
-    expected; anything else is a defect and keeps its traceback. Ctrl-C exits with 130, `Terminated` with 143;
-    where ``head`` has seen enough, a command ends without a word. With ``VTREFINE_DEBUG=1`` in the
-    environment every error keeps its traceback.
+    expected; anything else is a defect and keeps its traceback. Ctrl-C exits with 130, as `exit_status` says;
+    where ``head`` has seen enough, a command ends without a word, and with the status of a command that it
+    ran where that one failed. With ``VTREFINE_DEBUG=1`` in the environment every error keeps its traceback.
     """
 
     @functools.wraps(main)
@@ -224,9 +223,11 @@ def run_cli[**P](main: Callable[P, int | None]) -> Callable[P, int]:
             return status
         except KeyboardInterrupt as stopped:
             print(f"interrupted{f': {stopped}' if stopped.args else ''}", file=sys.stderr)
-            return TERMINATED_STATUS if isinstance(stopped, Terminated) else INTERRUPT_STATUS
+            return exit_status(stopped)
+        except subprocess.CalledProcessError as failed:
+            return failed.returncode
         except Exception as error:
-            if isinstance(error, BrokenPipeError) and _nobody_reads():
+            if isinstance(error, BrokenPipeError) and nobody_reads(sys.stdout):
                 return UNREAD_STATUS
             if not _is_expected(error) or os.environ.get(DEBUG_VARIABLE) == "1":
                 raise

@@ -2,17 +2,13 @@
 
 import os
 import subprocess
-import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-import torch
-
-from lerobot_vtrefine.cli.errors import run_cli
-from lerobot_vtrefine.cli.pipeline.stages import stop
+from lerobot_vtrefine.cli.pipeline.stages import own_sessions
 
 POLL_S = 0.5
 
@@ -31,6 +27,8 @@ Commands = Mapping[Path, Sequence[str]]
 """By the names of their folders."""
 Needs = Mapping[Path, Sequence[Path]]
 """Which of the commands must have succeeded before one starts."""
+Start = Callable[..., subprocess.Popen[bytes]]
+"""What `own_sessions` gives."""
 
 
 def run_all(commands: Commands, jobs: int, needs: Needs | None = None) -> None:
@@ -44,7 +42,9 @@ def run_all(commands: Commands, jobs: int, needs: Needs | None = None) -> None:
     """
     queue = Queue(list(commands), needs or {})
     jobs = max(1, min(jobs, len(commands)))
-    failed = (run_in_turn if jobs == 1 else partial(run_together, jobs=jobs))(commands, queue)
+    run = run_in_turn if jobs == 1 else partial(run_together, jobs=jobs)
+    with own_sessions() as start:
+        failed = run(commands, queue, start)
     if failed:
         raise failed[0]
 
@@ -78,42 +78,36 @@ class Queue:
             self.end(other, failed=True)
 
 
-def run_in_turn(commands: Commands, queue: Queue) -> list[subprocess.CalledProcessError]:
+def run_in_turn(commands: Commands, queue: Queue, start: Start) -> list[subprocess.CalledProcessError]:
     """Run the commands one after the other, in sight; the failures."""
     failed: list[subprocess.CalledProcessError] = []
     while (folder := queue.next()) is not None:
         print(f"\n== {folder.name}", flush=True)
-        child = subprocess.Popen(commands[folder], start_new_session=True)  # Ctrl-C is passed on, once
-        try:
-            status = child.wait()
-        except BaseException:
-            stop(child)
-            raise
+        status = start(commands[folder]).wait()
         failed += [subprocess.CalledProcessError(status, commands[folder])] if status else []
         queue.end(folder, bool(status))
     return failed
 
 
-def run_together(commands: Commands, queue: Queue, jobs: int) -> list[subprocess.CalledProcessError]:
+def run_together(
+    commands: Commands, queue: Queue, start: Start, jobs: int
+) -> list[subprocess.CalledProcessError]:
     """Run the commands side by side; the failures."""
     free, running = shares(jobs), {}
     failed: list[subprocess.CalledProcessError] = []
-    try:
-        while queue.waiting or running:
-            while free and (folder := queue.next()) is not None:
-                share = free.pop(0)
-                print(f"== {folder.name}: progress in {folder}.log", flush=True)
-                running[folder] = (start(commands[folder], folder, share), share)
-            for folder in [name for name, (child, _) in running.items() if child.poll() is not None]:
-                child, share = running.pop(folder)
-                free.append(share)
-                if child.returncode:
-                    failed.append(subprocess.CalledProcessError(child.returncode, commands[folder]))
-                print(f"== {folder.name}: {'failed' if child.returncode else 'done'}", flush=True)
-                queue.end(folder, bool(child.returncode))
-            time.sleep(POLL_S)
-    finally:
-        stop(*(child for child, _ in running.values()))
+    while queue.waiting or running:
+        while free and (folder := queue.next()) is not None:
+            share = free.pop(0)
+            print(f"== {folder.name}: progress in {folder}.log", flush=True)
+            running[folder] = (start_on(share, start, commands[folder], Path(f"{folder}.log")), share)
+        for folder in [name for name, (child, _) in running.items() if child.poll() is not None]:
+            child, share = running.pop(folder)
+            free.append(share)
+            if child.returncode:
+                failed.append(subprocess.CalledProcessError(child.returncode, commands[folder]))
+            print(f"== {folder.name}: {'failed' if child.returncode else 'done'}", flush=True)
+            queue.end(folder, bool(child.returncode))
+        time.sleep(POLL_S)
     return failed
 
 
@@ -134,24 +128,17 @@ def usable_cores() -> list[int]:
 
 def visible_gpus() -> list[str]:
     """The GPUs that this process may use, as ``CUDA_VISIBLE_DEVICES`` names them."""
-    named = os.environ.get("CUDA_VISIBLE_DEVICES")
-    return named.split(",") if named else [str(index) for index in range(torch.cuda.device_count())]
+    if named := os.environ.get("CUDA_VISIBLE_DEVICES"):
+        return named.split(",")
+    import torch
+
+    return [str(index) for index in range(torch.cuda.device_count())]
 
 
-def start(command: Sequence[str], folder: Path, share: Share) -> subprocess.Popen:
+def start_on(share: Share, start: Start, command: Sequence[str], log: Path) -> subprocess.Popen[bytes]:
     """One command in the background, on its share of the machine."""
-    folder.parent.mkdir(parents=True, exist_ok=True)
+    log.parent.mkdir(parents=True, exist_ok=True)
     pin = partial(os.sched_setaffinity, 0, share.cores) if share.cores else None
     env = os.environ | ({"CUDA_VISIBLE_DEVICES": share.gpu} if share.gpu else {})
-    with Path(f"{folder}.log").open("wb") as log:
-        return subprocess.Popen(
-            command, stdout=log, stderr=subprocess.STDOUT, preexec_fn=pin, env=env, start_new_session=True
-        )
-
-
-def run_script(entry: Callable[[], None]) -> None:
-    """Run a script's entry as `run_cli` does; the status of a command that failed is its own."""
-    try:
-        sys.exit(run_cli(entry)())
-    except subprocess.CalledProcessError as error:
-        sys.exit(error.returncode)
+    with log.open("wb") as file:
+        return start(command, stdout=file, stderr=subprocess.STDOUT, preexec_fn=pin, env=env)

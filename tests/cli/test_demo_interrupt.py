@@ -1,9 +1,12 @@
-"""``vtrefine-demo`` really interrupted: its stage ends with it, and the next run goes on from there."""
+"""Commands that run others, really interrupted: these may save first, and what is asked to go on does so."""
 
+import fcntl
 import os
+import pty
 import signal
 import subprocess
 import sys
+import termios
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -11,8 +14,9 @@ from pathlib import Path
 import pytest
 
 from lerobot_vtrefine.cli.pipeline.stages import QUIET_S, STOPPING
+from lerobot_vtrefine.interrupts import KINDS
 
-SCRIPTS = Path(__file__).parents[2] / "scripts"
+ROOT = Path(__file__).parents[2]
 DEMO = """
 import sys
 from pathlib import Path
@@ -45,13 +49,15 @@ def alive(pid: int) -> bool:
     return status.is_file() and status.read_text().rsplit(")", 1)[1].split()[0] != "Z"
 
 
-def hear_interrupts() -> None:
-    """A shell's background job, which these tests may be, starts its children deaf to Ctrl-C."""
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
+def hear_everything() -> None:
+    """In a child: these tests may be a shell's background job under ``nohup``, deaf to some signals."""
+    for number in KINDS:
+        signal.signal(number, signal.SIG_DFL)
 
 
-def ignore_interrupts() -> None:
-    """As such a shell does; SIGTERM is what ends its jobs."""
+def hear_all_but_interrupts() -> None:
+    """As a shell's background jobs do."""
+    hear_everything()
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
@@ -67,7 +73,7 @@ def text_of(note: Path, running: subprocess.Popen[str]) -> str:
 
 @pytest.mark.skipif(not Path("/proc/self/stat").is_file(), reason="looks at processes in /proc")
 @pytest.mark.parametrize(
-    ("number", "inherited"), [(signal.SIGINT, hear_interrupts), (signal.SIGTERM, ignore_interrupts)]
+    ("number", "inherited"), [(signal.SIGINT, hear_everything), (signal.SIGTERM, hear_all_but_interrupts)]
 )
 def test_interrupted_demo_continues_from_its_last_finished_stage(
     tmp_path: Path, number: int, inherited: Callable[[], None]
@@ -79,7 +85,7 @@ def test_interrupted_demo_continues_from_its_last_finished_stage(
     child = int(text_of(tmp_path / "b" / "pid", running))
     os.kill(running.pid, number)
     _, errors = running.communicate(timeout=60)
-    assert (running.returncode, errors.splitlines()[-1]) == (130, "interrupted")
+    assert (running.returncode, errors.splitlines()[-1]) == (128 + number, "interrupted")
     assert not alive(child)
 
     again = subprocess.run(command, capture_output=True, text=True, check=False)
@@ -106,36 +112,36 @@ except KeyboardInterrupt:
 """
 """A command that takes its time to end, as fine-tuning does."""
 ONE_STAGE = """
-import signal, sys
+import sys
 from pathlib import Path
 from lerobot_vtrefine.cli.errors import run_cli
 from lerobot_vtrefine.cli.pipeline.stages import Stage, StageRunner
 
-signal.signal(signal.SIGINT, signal.default_int_handler)
 folder, command = Path(sys.argv[1]), tuple(sys.argv[2:])
 runner = StageRunner(folder, [Stage("a", "a", command, folder / "a", folder / "a" / "product")])
 raise SystemExit(run_cli(lambda: runner.run() and None)())
 """
 SIDE_BY_SIDE = """
-import signal, sys
+import sys
 from pathlib import Path
-from runs.side_by_side import run_all, run_script
+from lerobot_vtrefine.cli.errors import run_cli
+from runs.side_by_side import run_all
 
-signal.signal(signal.SIGINT, signal.default_int_handler)
 folder, jobs, command = Path(sys.argv[1]), int(sys.argv[2]), sys.argv[3:]
-run_script(lambda: run_all({folder / name: command for name in ("a", "b")[:jobs]}, jobs))
+raise SystemExit(run_cli(lambda: run_all({folder / name: command for name in ("a", "b")[:jobs]}, jobs))())
 """
 
 
-def begin(code: str, folder: Path, *arguments: str, takes_s: float) -> subprocess.Popen[str]:
+def begin(code: str, folder: Path, *arguments: str, takes_s: float, **options) -> subprocess.Popen[str]:
     """A runner of the command above."""
-    saves_first = ("python", "-c", SAVES_FIRST, str(folder), str(takes_s))
+    saves_first = (sys.executable, "-c", SAVES_FIRST, str(folder), str(takes_s))
+    path = os.pathsep.join([str(ROOT), str(ROOT / "scripts")])
+    options = {"stderr": subprocess.PIPE, "stdout": subprocess.DEVNULL} | options
     return subprocess.Popen(
         [sys.executable, "-c", code, str(folder), *arguments, *saves_first],
-        stderr=subprocess.PIPE,
-        stdout=subprocess.DEVNULL,
         text=True,
-        env=os.environ | {"PYTHONPATH": str(SCRIPTS)},
+        env=os.environ | {"PYTHONPATH": path, "CUDA_VISIBLE_DEVICES": "0"},  # nobody asks torch for GPUs
+        **{"preexec_fn": hear_everything} | options,
     )
 
 
@@ -159,11 +165,40 @@ def test_a_second_interrupt_ends_a_stage_at_once(tmp_path: Path) -> None:
     assert (tmp_path / "stopped").is_file()
 
 
-@pytest.mark.parametrize("jobs", [1, 2])
-def test_commands_of_a_script_may_save_before_they_end(tmp_path: Path, jobs: int) -> None:
+@pytest.mark.parametrize(
+    ("jobs", "number"),
+    [(1, signal.SIGINT), (2, signal.SIGINT), (1, signal.SIGTERM), (2, signal.SIGTERM), (2, signal.SIGHUP)],
+)
+def test_commands_of_a_script_may_save_before_they_end(tmp_path: Path, jobs: int, number: int) -> None:
     running = begin(SIDE_BY_SIDE, tmp_path, str(jobs), takes_s=1.0)
     text_of(tmp_path / "begun", running)
-    running.send_signal(signal.SIGINT)
+    running.send_signal(number)
     _, errors = running.communicate(timeout=60)
-    assert (running.returncode, errors.splitlines()[-1]) == (130, "interrupted")
+    assert (running.returncode, errors.splitlines()[-1]) == (128 + number, "interrupted")
+    assert (tmp_path / "saved").is_file()
+
+
+def test_a_closed_terminal_lets_the_stage_of_a_scripts_command_save(tmp_path: Path) -> None:
+    """Nothing can be printed any more, neither by the script nor by the command that it runs in sight."""
+    terminal, its_end = pty.openpty()
+
+    def own_terminal() -> None:
+        hear_everything()
+        fcntl.ioctl(0, termios.TIOCSCTTY, 0)
+
+    inner = (sys.executable, "-c", ONE_STAGE, str(tmp_path))
+    running = begin(
+        SIDE_BY_SIDE,
+        tmp_path,
+        "1",
+        *inner,
+        takes_s=QUIET_S + 1.0,
+        **dict.fromkeys(("stdin", "stdout", "stderr"), its_end),
+        start_new_session=True,
+        preexec_fn=own_terminal,
+    )
+    os.close(its_end)
+    text_of(tmp_path / "begun", running)
+    os.close(terminal)
+    assert running.wait(timeout=60) == 128 + signal.SIGHUP
     assert (tmp_path / "saved").is_file()

@@ -18,6 +18,7 @@ from lerobot_vtrefine.cli.play import PlayConfig
 from lerobot_vtrefine.cli.record_demos import RecordDemosConfig
 from lerobot_vtrefine.cli.replay import ReplayConfig
 from lerobot_vtrefine.finetune.pipeline import FinetunePipelineConfig
+from lerobot_vtrefine.interrupts import HungUp, Terminated
 
 
 def failing(error: BaseException):
@@ -52,9 +53,16 @@ def test_expected_error_is_one_line(error: Exception, line: str, capsys: pytest.
     assert capsys.readouterr().err == line + "\n"
 
 
-def test_interrupt(capsys: pytest.CaptureFixture[str]) -> None:
-    assert failing(KeyboardInterrupt())() == 130
+@pytest.mark.parametrize(
+    ("error", "status"), [(KeyboardInterrupt(), 130), (Terminated(), 143), (HungUp(), 129)]
+)
+def test_interrupt(error: KeyboardInterrupt, status: int, capsys: pytest.CaptureFixture[str]) -> None:
+    assert failing(error)() == status
     assert capsys.readouterr().err == "interrupted\n"
+
+
+def test_the_status_of_a_failed_command_is_that_of_the_one_that_ran_it() -> None:
+    assert failing(subprocess.CalledProcessError(3, ["vtrefine-demo"]))() == 3
 
 
 def test_defects_and_debug_keep_the_traceback(monkeypatch: pytest.MonkeyPatch) -> None:

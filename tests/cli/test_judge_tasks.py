@@ -3,7 +3,6 @@
 import json
 import sys
 from pathlib import Path
-from types import SimpleNamespace
 
 import draccus
 import judge_tasks as script
@@ -62,12 +61,12 @@ def test_a_study_has_both_networks_unless_told_otherwise(
 ) -> None:
     asked: list[list[str]] = []
 
-    def run(command: list[str], check: bool) -> SimpleNamespace:
+    def run(commands: dict[Path, list[str]], jobs: int) -> None:
+        ((folder, command),) = commands.items()
         asked.append(command)
-        write_study(tmp_path / "information_hard", vision=60)
-        return SimpleNamespace(returncode=0)
+        write_study(folder, vision=60)
 
-    monkeypatch.setattr(script.subprocess, "run", run)
+    monkeypatch.setattr(script, "run_all", run)
     arguments = ["hard", f"--outputs={tmp_path}", f"--results={tmp_path / 'touch_tasks.json'}"]
     monkeypatch.setattr(sys, "argv", ["judge_tasks.py", *arguments, "--effort.networks=[policy]"])
     assert script.main() == 0

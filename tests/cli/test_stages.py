@@ -1,5 +1,6 @@
 """Stages run once, again when what they depend on changes, and say why they failed."""
 
+import errno
 import io
 import sys
 import time
@@ -34,6 +35,24 @@ def test_finished_stages_are_skipped(tmp_path: Path) -> None:
     assert "done before" not in run(tmp_path, *chain)
     assert run(tmp_path, *chain).count("done before") == 2
     assert (tmp_path / "a" / "product").read_text() == "x"
+
+
+class Closed(io.StringIO):
+    """A terminal that was closed meanwhile, or text that nobody takes."""
+
+    def __init__(self, terminal: bool) -> None:
+        super().__init__()
+        self.isatty = lambda: terminal
+
+    def write(self, text: str) -> int:
+        raise OSError(errno.EIO, "Input/output error")
+
+
+@pytest.mark.parametrize("terminal", [True, False])
+def test_what_cannot_be_shown_ends_no_stage(tmp_path: Path, terminal: bool) -> None:
+    slow = stage(tmp_path, "a", code=f"{WRITE}; import time; time.sleep(0.5)")
+    StageRunner(tmp_path, [slow], LiveLine(Closed(terminal))).run()
+    assert slow.product.read_text() == "x"
 
 
 def test_changed_command_reruns_it_and_what_needs_it(tmp_path: Path) -> None:

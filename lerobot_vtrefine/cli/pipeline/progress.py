@@ -2,6 +2,7 @@
 
 import re
 import sys
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TextIO
@@ -59,7 +60,10 @@ def clock(seconds: float) -> str:
 
 
 class LiveLine:
-    """One line per stage: a bar on a terminal, else text that is printed each minute and at the end."""
+    """One line per stage: a bar on a terminal, else text that is printed each minute and at the end.
+
+    A terminal that was closed shows nothing more; that ends no stage.
+    """
 
     def __init__(self, stream: TextIO | None = None) -> None:
         self.console = Console(file=stream or sys.stderr, highlight=False, markup=False)
@@ -68,6 +72,10 @@ class LiveLine:
 
     def show(self, label: str, child: ChildProgress | None, seconds: float) -> None:
         """Show a running stage."""
+        with suppress(OSError):
+            self._show(label, child, seconds)
+
+    def _show(self, label: str, child: ChildProgress | None, seconds: float) -> None:
         if not self.console.is_terminal:
             if seconds - self._last_plain >= PLAIN_INTERVAL_S:
                 self._last_plain = seconds
@@ -97,8 +105,10 @@ class LiveLine:
     def stop(self) -> None:
         """Take the live line away."""
         if self._bar is not None:
-            self._bar.stop()
+            with suppress(OSError):
+                self._bar.stop()
             self._bar = None
 
     def _print(self, text: str) -> None:
-        self.console.print(text, soft_wrap=True)
+        with suppress(OSError):
+            self.console.print(text, soft_wrap=True)

@@ -10,13 +10,17 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
+from typing import Any
 
+from lerobot_vtrefine.cli.errors import nobody_reads
 from lerobot_vtrefine.cli.pipeline.progress import LiveLine, parse_progress, read_tail
 from lerobot_vtrefine.cli.results.provenance import commit
 from lerobot_vtrefine.files import decode, read_json
+from lerobot_vtrefine.interrupts import ends_like_ctrl_c, interrupts_wait
 
 POLL_S = 0.25
 QUIET_S = 2.0
@@ -187,17 +191,15 @@ class StageRunner:
         log.parent.mkdir(parents=True, exist_ok=True)
         log.unlink(missing_ok=True)  # a command that outlived an earlier run may go on writing to its own
         started = time.monotonic()
-        with log.open("wb") as file:
+        with log.open("wb") as file, own_sessions() as start:
             file.write(f"$ {stage.line}\n".encode())
             file.flush()
-            child = subprocess.Popen(
+            child = start(
                 [find_command(stage.command[0]), *stage.command[1:]],
                 stdin=subprocess.DEVNULL,
                 stdout=file,
                 stderr=subprocess.STDOUT,
                 env=child_environment(),
-                start_new_session=True,
-                preexec_fn=_hear_interrupts,
             )
             try:
                 while child.poll() is None:
@@ -205,7 +207,6 @@ class StageRunner:
                     time.sleep(POLL_S)
             except BaseException:
                 self.line.stop()
-                stop(child)
                 raise
         if child.returncode:
             self.line.finish(label, "failed")
@@ -237,6 +238,8 @@ def stop(*children: subprocess.Popen[bytes]) -> None:
     """Ask children and their workers to end as Ctrl-C does, again where there is another Ctrl-C or they take
     long, and end them if they do not.
     """
+    for stream in (sys.stdout, sys.stderr):
+        nobody_reads(stream)  # a closed terminal makes every print an error
     _signal(children, signal.SIGINT)
     with contextlib.suppress(KeyboardInterrupt):
         if not _have_ended(children, QUIET_S):
@@ -256,9 +259,34 @@ def end(*children: subprocess.Popen[bytes]) -> None:
         child.wait()
 
 
-def _hear_interrupts() -> None:
+@contextlib.contextmanager
+def own_sessions(ending: Callable[..., None] = stop) -> Generator[Callable[..., subprocess.Popen[bytes]]]:
+    """Commands in sessions of their own, so that what this process is sent reaches them by it alone, once.
+
+    What still runs when the block ends, by Ctrl-C, SIGTERM, SIGHUP or an error, is ended by ``ending``.
+
+    Yields: starts a command, with the options of ``subprocess.Popen``.
+    """
+    children: list[subprocess.Popen[Any]] = []
+
+    def start(command: Sequence[str], **options: Any) -> subprocess.Popen[bytes]:
+        with interrupts_wait():
+            prepare = partial(_hear_interrupts, options.pop("preexec_fn", None))
+            children.append(subprocess.Popen(command, start_new_session=True, preexec_fn=prepare, **options))
+        return children[-1]
+
+    with ends_like_ctrl_c():
+        try:
+            yield start
+        finally:
+            ending(*(child for child in children if child.poll() is None))
+
+
+def _hear_interrupts(prepare: Callable[[], None] | None) -> None:
     """In a child: a shell starts jobs in the background deaf to Ctrl-C, which children would inherit."""
     signal.signal(signal.SIGINT, signal.SIG_DFL)
+    if prepare is not None:
+        prepare()
 
 
 def _signal(children: Sequence[subprocess.Popen[bytes]], number: int) -> None:
