@@ -21,6 +21,7 @@ import numpy as np
 from tqdm import tqdm
 
 from lerobot_vtrefine.cli.results.provenance import write_provenance
+from lerobot_vtrefine.interrupts import ends_like_ctrl_c
 
 ROWS = "rows.jsonl"
 Row = dict[str, Any]
@@ -70,15 +71,21 @@ def run_sets[T](work: Callable[[T], Row], sets: dict[str, T], options: argparse.
     last_start = time.time() + 60 * options.minutes
     context = multiprocessing.get_context("spawn")
     with (
+        ends_like_ctrl_c(),
         ProcessPoolExecutor(options.jobs, context) as pool,
         (folder / ROWS).open("a", encoding="utf-8") as file,
     ):
         jobs = [pool.submit(partial(_row, work, last_start), name, item) for name, item in todo.items()]
-        for job in tqdm(as_completed(jobs), total=len(jobs), unit="set", mininterval=10):
-            if (row := job.result()) is not None:
-                file.write(f"\n{json.dumps(row)}" if file.tell() else json.dumps(row))
-                file.flush()
-                known[row["set"]] = row
+        try:
+            for job in tqdm(as_completed(jobs), total=len(jobs), unit="set", mininterval=10):
+                if (row := job.result()) is not None:
+                    file.write(f"\n{json.dumps(row)}" if file.tell() else json.dumps(row))
+                    file.flush()
+                    known[row["set"]] = row
+        except KeyboardInterrupt:
+            for worker in multiprocessing.active_children():
+                worker.terminate()
+            raise
     return [known[name] for name in sets if name in known]
 
 

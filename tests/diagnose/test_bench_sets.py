@@ -2,9 +2,15 @@
 
 import argparse
 import json
+import multiprocessing
+import os
+import signal
+import time
 from pathlib import Path
 
 import pytest
+
+from lerobot_vtrefine.interrupts import Terminated
 
 SCRIPTS = Path(__file__).parents[2] / "scripts"
 
@@ -39,3 +45,21 @@ def test_a_run_that_was_cut_goes_on(bench_sets, tmp_path: Path) -> None:
 def test_nothing_begins_after_the_time(bench_sets, tmp_path: Path) -> None:
     assert bench_sets.run_sets(square, {"two": 2}, options(tmp_path, minutes=-1.0)) == []
     assert bench_sets.read_rows(tmp_path) == {}
+
+
+def end_the_run(note: Path) -> dict[str, int]:
+    os.kill(os.getppid(), signal.SIGTERM)
+    time.sleep(10)
+    note.touch()
+    return {}
+
+
+def test_a_run_that_is_terminated_leaves_no_process_behind(bench_sets, tmp_path: Path) -> None:
+    before = signal.signal(signal.SIGTERM, lambda *_: None)
+    try:
+        with pytest.raises(Terminated):
+            bench_sets.run_sets(end_the_run, {"one": tmp_path / "note"}, options(tmp_path))
+    finally:
+        signal.signal(signal.SIGTERM, before)
+    assert not multiprocessing.active_children()
+    assert not (tmp_path / "note").exists(), "it was waited for"
