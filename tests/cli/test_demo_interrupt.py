@@ -36,6 +36,8 @@ def stage(name, code, **options):
     product = folder / name / "product"
     return Stage(name, name, ("python", "-c", code, str(product)), product.parent, product, **options)
 
+# Importing torch would take longer than all else here.
+sys.modules["lerobot_vtrefine.finetune.distributed"] = SimpleNamespace(check_device=lambda device: None)
 demo.parse_config = lambda arguments: SimpleNamespace(output_dir=folder, device="cpu")
 demo.demo_stages = lambda config: [stage("a", first), stage("b", second, needs=("a",), resumable=True)]
 demo.write_report = lambda config, records: folder / "report.html"

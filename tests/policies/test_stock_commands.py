@@ -94,17 +94,19 @@ def test_training_writes_a_checkpoint_that_loads(trained: Path) -> None:
     assert average_steps(trained / "checkpoints" / "000010") == 10
 
 
-def test_training_resumes_where_it_stopped(trained: Path) -> None:
+def test_training_resumes_where_it_stopped(
+    trained: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
     config = trained / "checkpoints" / "last" / "pretrained_model" / "train_config.json"
-    printed = command(
-        "lerobot-train",
+    train_here(
+        monkeypatch,
         f"--config_path={config}",
         "--resume=true",
         "--steps=14",
         "--save_freq=14",
         "--num_workers=0",
     )
-    assert "step:12" in printed
+    assert "step:12" in capfd.readouterr().err
     assert average_steps(trained / "checkpoints" / "000014") == 14
 
 
