@@ -4,6 +4,7 @@ import json
 
 import numpy as np
 import pytest
+from fake_diagnosis import robot_diagnosis
 from object_rigs import record, write_dataset
 
 from lerobot_vtrefine.cli.diagnose import main
@@ -11,6 +12,7 @@ from lerobot_vtrefine.diagnose.dataset.engine import merged
 from lerobot_vtrefine.diagnose.joints.dataset import read_dataset
 from lerobot_vtrefine.diagnose.joints.engine import diagnose_robot
 from lerobot_vtrefine.diagnose.parts.engine import unknown_parts
+from lerobot_vtrefine.diagnose.verdict import Unknown
 from lerobot_vtrefine.sim.config import CameraConfig, SceneConfig
 
 CAMERA = CameraConfig(80, 60, 0.56, (-0.46, 0.0, 0.46), (0.0, 0.0, 0.09))
@@ -55,3 +57,8 @@ def test_a_dataset_without_known_parts_says_so(tmp_path) -> None:
     undecided = {item.name: item.reason for item in found.evidence if item.decision == "not identifiable"}
     assert "parts are not known" in undecided["object_mass"]
     assert {"object_friction", "clearance"} <= set(undecided)
+
+
+def test_what_would_explain_a_robot_as_well_is_kept_beside_parts() -> None:
+    doubtful = robot_diagnosis(unknown=Unknown(False, "something else explains as much"))
+    assert merged(doubtful, unknown_parts()).verdict.unknown == doubtful.verdict.unknown

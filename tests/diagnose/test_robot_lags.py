@@ -8,15 +8,21 @@ import numpy as np
 import pytest
 from robot_rigs import Rig, make_set
 
+from lerobot_vtrefine.diagnose.core.heldout import cross_validated
+from lerobot_vtrefine.diagnose.core.resampling import folds_of
 from lerobot_vtrefine.diagnose.core.search import ALL
-from lerobot_vtrefine.diagnose.joints import lags, problem, twin_problem
+from lerobot_vtrefine.diagnose.joints import lags, problem
 from lerobot_vtrefine.diagnose.joints.batch import Batch, make_batch
-from lerobot_vtrefine.diagnose.joints.engine import diagnose_robot
+from lerobot_vtrefine.diagnose.joints.candidates import PLAIN
+from lerobot_vtrefine.diagnose.joints.engine import JointAccount, diagnose_robot
+from lerobot_vtrefine.diagnose.joints.parameters import INDEX
 from lerobot_vtrefine.diagnose.joints.servo import Columns, simulate
+from lerobot_vtrefine.diagnose.joints.twin_problem import TwinProblem
 from lerobot_vtrefine.diagnose.recordings import RobotTrial, read_recording_set
+from lerobot_vtrefine.diagnose.report.words import doubts, headline
 
 SMALL = Rig(joints=("shoulder", "elbow", "waist"), rate_hz=20.0, seconds=5.0, conditions=8, noise=0.5)
-FILTER_MS = 80.0
+FILTER_MS, SHORT_MS = 80.0, 10.0
 _TOLD = re.compile(r"(\w+): commands seem to ([^;]*?) (\d+) ms \[(\d+), (\d+)\]")
 
 
@@ -61,6 +67,41 @@ def test_one_delay_of_all_is_explained(spread, tmp_path) -> None:
     assert verdict.status == "explained"
     (cause,) = verdict.causes
     assert (cause.name, set(cause.params)) == ("control_latency", {"tau_s"})
+    assert (verdict.unknown.clue, verdict.next_experiment) == (None, None)
+
+
+def test_a_low_pass_that_is_short_for_the_frames_is_told_beside_the_delay(tmp_path) -> None:
+    verdict = diagnosed(replace(SMALL, filter_s=SHORT_MS / 1e3), tmp_path)
+    assert verdict.status == "explained"
+    assert [cause.name for cause in verdict.causes] == ["control_latency"]
+    assert not verdict.unknown.alarm
+    text, _, times = verdict.unknown.clue.partition("; time constants: ")
+    assert "in place of the delay explain as much" in text
+    told = re.findall(r"(\w+) \d+ ms \[(\d+), (\d+)\]", times)
+    assert [joint for joint, _, _ in told] == list(SMALL.joints)
+    assert all(int(low) <= SHORT_MS <= int(high) for _, low, high in told)
+    assert verdict.next_experiment["decides"] == ["control_latency"]
+    assert "at a higher rate" in verdict.next_experiment["text"]
+    assert "It may be something else" in headline(verdict, "rad")
+    assert verdict.unknown.clue in " ".join(doubts(verdict, 16, 16))
+
+
+def test_a_low_pass_as_long_as_the_delay_is_tried_where_other_starts_fail(monkeypatch, tmp_path) -> None:
+    def stuck(candidate, posed, now, late_s=0.0):
+        return replace(now, free=candidate.freed(now.free, np.arange(posed.batch.joints)), tau_free=False)
+
+    monkeypatch.setattr(lags, "_with", stuck)
+    verdict = diagnosed(replace(SMALL, filter_s=SHORT_MS / 1e3), tmp_path)
+    told = re.findall(r"(\d+) ms \[", verdict.unknown.clue)
+    assert min(map(int, told)) >= SHORT_MS / 2
+
+
+def test_trials_left_out_are_predicted_where_a_low_pass_may_change_places(tmp_path) -> None:
+    recorded = read_recording_set(make_set(replace(SMALL, filter_s=SHORT_MS / 1e3, seconds=3.0), tmp_path, 2))
+    posed = problem.JointProblem.of(recorded.joints, make_batch(recorded.trials))
+    fitted, folds = lags._with(lags.LOW_PASS, posed, posed.baseline()), folds_of(posed.conditions, 0)
+    assert (cross_validated(posed, fitted, folds).mean(0) > 100 * fitted.total).any()  # one Newton step
+    assert (lags._left_out(posed, fitted, folds).mean(0) < 1.1 * fitted.total).all()
 
 
 def test_robots_of_which_nothing_is_left_are_not_asked_about_lags(tmp_path, monkeypatch) -> None:
@@ -74,12 +115,31 @@ def test_robots_of_which_nothing_is_left_are_not_asked_about_lags(tmp_path, monk
 
 
 def test_replays_on_a_twin_are_not_asked_about_lags(monkeypatch) -> None:
-    monkeypatch.setattr(twin_problem, "suspicions", lambda selection: [])
     monkeypatch.setattr(problem, "suspicions", lambda selection: [])
-    monkeypatch.setattr(problem, "lags", lambda selection, seed: ["asked"])
+    for name in ("lags", "in_place_of_delay"):
+        monkeypatch.setattr(problem, name, lambda selection, seed: ["asked"])
     late = SimpleNamespace(chosen={ALL: ()})
-    assert problem.JointProblem.suspicions(None, late, 0) == ["asked"]
-    assert twin_problem.TwinProblem.suspicions(None, late, 0) == []
+    for kind, asked in ((problem.JointProblem, ["asked"]), (TwinProblem, [])):
+        posed = SimpleNamespace(asks_lags=kind.asks_lags, delay_spread_s=0.0)
+        assert kind.suspicions(posed, late, 0) == asked
+        assert kind.nameless_rivals(posed, late, 0) == asked
+
+
+@pytest.mark.parametrize("asks", [True, False])
+def test_the_reason_for_a_delay_says_where_low_passes_were_not_asked_about(asks) -> None:
+    posed = SimpleNamespace(asks_lags=asks, delay_spread_s=0.0)
+    free = np.zeros((1, len(INDEX)), bool)
+    selection = SimpleNamespace(
+        problem=posed, fit=SimpleNamespace(free=free), candidates_of=lambda *_: (PLAIN["control_latency"],)
+    )
+    account = SimpleNamespace(selection=selection, estimates=SimpleNamespace(selection=selection))
+    assert ("low-pass" in JointAccount.caveat(account, "control_latency", (0,))) is not asks
+
+
+def test_delays_that_scatter_are_no_low_pass(monkeypatch) -> None:
+    monkeypatch.setattr(problem, "in_place_of_delay", lambda selection, seed: ["asked"])
+    posed = SimpleNamespace(asks_lags=True, delay_spread_s=0.01)
+    assert not problem.JointProblem.nameless_rivals(posed, SimpleNamespace(chosen={ALL: ()}), 0)
 
 
 def stepped(filtered, friction, omega, zeta, late=0.0) -> tuple[Batch, Columns]:

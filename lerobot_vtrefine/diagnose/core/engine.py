@@ -86,6 +86,8 @@ def infer[P: Problem[Any, Any]](
         selection, rivals = settled(selection, found(selection, seed=seed), seed)
         if selection is not before:
             alarms = raise_alarms(selection, selection.problem.suspicions(selection, seed), seed)
+    if not alarms:
+        rivals = (*rivals, *selection.problem.nameless_rivals(selection, seed))
     tell(f"{whole.subject}: settling the sizes", 0.8)
     selection, whole = _settled_finely(named_only(selection), whole)
     test = whole.subset(locked) if len(locked) else selection.problem

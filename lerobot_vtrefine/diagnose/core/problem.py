@@ -119,6 +119,12 @@ class OptionalSteps(Protocol):
         """What else than the errors decides a tie: 1 for the rival, -1 for the cause, 0 for neither."""
         return 0
 
+    def nameless_rivals(
+        self, selection: "Selection[Any, Any, Any]", seed: int
+    ) -> "Sequence[Rival[Any, Any]]":
+        """What has no name, and explains as much in the place of an accepted cause; its clue says it."""
+        return ()
+
     def finer(self) -> Self | None:
         """The same trials with predictions for which the search is too slow; None where there are none."""
         return None

@@ -50,7 +50,7 @@ def tell(found: Found, account: Account[Any, Any]) -> Diagnosis:
         _status(bool(causes), bool(ambiguous), alarmed),
         causes,
         ambiguous,
-        _unknown(found.alarms, test.channels),
+        _unknown(found, test.channels),
         held if found.locked else None,
         detectable,
         account.next_experiment(found.rivals, found.alarms),
@@ -83,7 +83,8 @@ def _status(causes: bool, ambiguous: bool, alarmed: bool) -> Status:
 
 def _pairs(found: Found) -> tuple[tuple[str, ...], ...]:
     """Names that tie, every pair once."""
-    pairs = {frozenset((item.cause, item.name)): (item.cause, item.name) for item in reversed(found.rivals)}
+    named = [(item.cause, item.name) for item in found.rivals if not item.candidate.clue]
+    pairs = {frozenset(pair): pair for pair in reversed(named)}
     return tuple(reversed(pairs.values()))
 
 
@@ -94,9 +95,12 @@ def _gain(found: Found, cause: str, channels: tuple[int, ...]) -> float:
     return float(1 - now / max(without, 1e-300))
 
 
-def _unknown(alarms: Sequence[Alarm], channels: tuple[str, ...]) -> Unknown:
+def _unknown(found: Found, channels: tuple[str, ...]) -> Unknown:
+    """Alarms; where there are none, what without a name ties with a cause."""
+    alarms: Sequence[Alarm] = found.alarms
     if not alarms:
-        return Unknown(alarm=False)
+        clues = [item.candidate.clue for item in found.rivals if item.candidate.clue]
+        return Unknown(False, "; ".join(clues) or None)
     if len(channels) == 1:
         clues = [alarm.clue for alarm in alarms]
         more = "" if len(clues) <= _CLUES else f"; and {len(clues) - _CLUES} more"

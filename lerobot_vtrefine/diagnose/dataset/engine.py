@@ -82,7 +82,7 @@ def merged(robot: Diagnosis, other: Diagnosis) -> Diagnosis:
     if two.causes and one.status == "adequate":
         robot = replace(robot, trial_errors=other.trial_errors, unit=other.unit, traces=(), residuals=())
         one = replace(one, heldout=two.heldout)
-    unknown = one.unknown if one.unknown.alarm else two.unknown
+    unknown = max(one.unknown, two.unknown, key=lambda item: (item.alarm, bool(item.clue)))
     causes = [
         replace(cause, role="symptom") if unknown.alarm else cause for cause in (*one.causes, *two.causes)
     ]

@@ -85,6 +85,8 @@ class JointAccount:
         spread = self.estimates.selection.problem.delay_spread_s
         if spread and any(form.shared for form in forms):
             return f", which changes from command to command by about {1e3 * spread:.0f} ms"
+        if not self.selection.problem.asks_lags and any(form.shared for form in forms):
+            return "; whether commands pass a low-pass in place of it, no replay on a twin was asked"
         free = self.selection.fit.free[list(channels)]
         if not free[:, INDEX["stop"]].any() or free[:, INDEX["bend"]].any():
             return ""

@@ -30,9 +30,9 @@ PROTOCOLS = {
 
 
 def for_rivals(selection: "Selected", rivals: Sequence[Rival[Any, Any]]) -> dict[str, Any]:
-    """The protocol that separates the strongest tie best, as the verdict's `next_experiment`."""
-    rival = max(rivals, key=lambda item: item.p_value)
-    decides = [rival.cause, rival.name]
+    """The protocol that separates the strongest tie best, of names first: the verdict's `next_experiment`."""
+    rival = max(rivals, key=lambda item: (not item.candidate.clue, item.p_value))
+    decides = [rival.cause] if rival.candidate.clue else [rival.cause, rival.name]
     gaps = {name: _gap(selection, rival, name) for name in PROTOCOLS}
     best = max(gaps, key=lambda name: gaps[name])
     where = ", ".join(selection.problem.names[joint] for joint in rival.channels)
@@ -44,8 +44,9 @@ def for_rivals(selection: "Selected", rivals: Sequence[Rival[Any, Any]]) -> dict
         "predicted_gap_in_noise": round(gaps[best], 2),
     }
     text = f"Record {ENOUGH_TRIALS} trials of {where}: {PROTOCOLS[best]}."
-    more = next((PLAIN[name].decided_by for name in decides if PLAIN[name].decided_by), "")
-    if told_by_load(*decides) and selection.problem.batch.load is None:
+    both = [PLAIN.get(name, rival.candidate) for name in (rival.cause, rival.name)]
+    more = next((item.decided_by for item in both if item.decided_by), "")
+    if told_by_load(*both) and selection.problem.batch.load is None:
         protocol["columns"] = ["load"]
         text += " Record the servos' torque or current as `load`: friction takes torque, play takes none."
     elif more:

@@ -22,6 +22,8 @@ _RADIANS_PER_FRAME = (6.0, 3.0)
 """Fastest servo that frames can tell, well damped and swinging: beyond, oscillations alias."""
 TAU_BOUND_S = 1.0
 _LARGEST = {"round": 1.0, "stick": 3.0} | dict.fromkeys(TIMES, TAU_BOUND_S)
+SETTLING = 5
+"""Steps of a refit that begins next to its end."""
 _TOLERANCE = 1e-5
 _RIDGE = (1e-4, 3e-3)  # where commands are repeated, and where nothing tells misfit from sag
 _LEAST_DAMPING = 1e-9

@@ -12,10 +12,10 @@ from lerobot_vtrefine.diagnose.core.rules import LEAST_GAIN, RESOLVED
 from lerobot_vtrefine.diagnose.core.search import ALL, Selection
 from lerobot_vtrefine.diagnose.core.suspicion import Suspicion, confirmed
 from lerobot_vtrefine.diagnose.joints import gravity
-from lerobot_vtrefine.diagnose.joints.candidates import CATALOGUE, told_by_load
+from lerobot_vtrefine.diagnose.joints.candidates import CATALOGUE, PLAIN, told_by_load
 from lerobot_vtrefine.diagnose.joints.candidates.base import Candidate
 from lerobot_vtrefine.diagnose.joints.fitting import Fit, evaluate, fit, refit, servo_only
-from lerobot_vtrefine.diagnose.joints.lags import lags
+from lerobot_vtrefine.diagnose.joints.lags import in_place_of_delay, lags
 from lerobot_vtrefine.diagnose.joints.newton import Refits, refits
 from lerobot_vtrefine.diagnose.joints.parameters import INDEX, SAG
 from lerobot_vtrefine.diagnose.joints.rules import EXTRAPOLATION, LEAST_EFFECT_M, LEAST_EFFECT_RAD
@@ -40,6 +40,8 @@ class JointProblem(ServoTrials, OptionalSteps):
 
     delay_spread_s: float = 0.0
     """By how much the delay changes from command to command."""
+    asks_lags: bool = True
+    """Whether low-passes, and delays of single joints, are asked about."""
 
     @property
     def subject(self) -> str:
@@ -181,12 +183,19 @@ class JointProblem(ServoTrials, OptionalSteps):
         self, rival: Rival[Fit, Candidate], selection: Selection[Any, Fit, Candidate], seed: int
     ) -> int:
         """Between what the servo pulls against, such as friction, and what takes no force, such as play."""
-        if self.batch.load is None or not told_by_load(rival.cause, rival.name):
+        if self.batch.load is None or not told_by_load(PLAIN[rival.cause], PLAIN[rival.name]):
             return 0
         return load_prefers(self, rival.fit, selection.fit, rival.channels[0], seed)
 
     def suspicions(self, selection: Selection[Any, Fit, Candidate], seed: int) -> list[Suspicion]:
         """See `joints.suspicions`; and `joints.lags` where a delay has a name, or anything is left."""
         found = suspicions(selection)
-        asked = ALL in selection.chosen or confirmed(found, seed)
+        asked = self.asks_lags and (ALL in selection.chosen or confirmed(found, seed))
         return [*found, *(lags(selection, seed) if asked else ())]
+
+    def nameless_rivals(
+        self, selection: Selection[Any, Fit, Candidate], seed: int
+    ) -> list[Rival[Fit, Candidate]]:
+        """A low-pass in the place of a delay; of one that changes from command to command it has nothing."""
+        asked = self.asks_lags and ALL in selection.chosen and not self.delay_spread_s
+        return in_place_of_delay(selection, seed) if asked else []

@@ -19,16 +19,15 @@ import mujoco
 import numpy as np
 from mujoco.batch import Batch as Worlds
 
-from lerobot_vtrefine.diagnose.core.suspicion import Suspicion
 from lerobot_vtrefine.diagnose.joints import gravity
 from lerobot_vtrefine.diagnose.joints.batch import Batch, frame_s
 from lerobot_vtrefine.diagnose.joints.candidates import CATALOGUE
 from lerobot_vtrefine.diagnose.joints.candidates.base import Candidate
+from lerobot_vtrefine.diagnose.joints.fitting import SETTLING
 from lerobot_vtrefine.diagnose.joints.parameters import INDEX, PARAMETERS, SAG
-from lerobot_vtrefine.diagnose.joints.problem import JointProblem, Selected
+from lerobot_vtrefine.diagnose.joints.problem import JointProblem
 from lerobot_vtrefine.diagnose.joints.servo import play_operator
 from lerobot_vtrefine.diagnose.joints.servo_trials import Point
-from lerobot_vtrefine.diagnose.joints.suspicions import suspicions
 from lerobot_vtrefine.embodiments import get_embodiment
 from lerobot_vtrefine.sim import task
 from lerobot_vtrefine.sim.backends.batch import usable_cores
@@ -39,8 +38,6 @@ Array = np.ndarray
 
 NOMINAL = (20.0, 1.0)
 """Frequency [rad/s] and damping ratio that stand for the twin's servos as they come."""
-_SETTLING = 5
-"""Steps of a refit that begins next to its end."""
 COARSE_S, FINE_S = 0.02, 0.005
 """Steps of the replays by which causes are sought, and by which their sizes are settled."""
 
@@ -56,6 +53,8 @@ class TwinProblem(JointProblem):
     fine: "TwinProblem | None" = None
     """The same trials, to be replayed in fine steps."""
 
+    asks_lags: bool = False
+    """Its servos fade like low-passes of 75 to 170 ms: one on commands would change places with them."""
     shared_encoders: bool = True
     vague: float = 0.03
     misfit: float = 0.2
@@ -88,7 +87,7 @@ class TwinProblem(JointProblem):
         return (
             None
             if self.fine is None
-            else replace(self.fine, iterations=_SETTLING, delay_spread_s=self.delay_spread_s)
+            else replace(self.fine, iterations=SETTLING, delay_spread_s=self.delay_spread_s)
         )
 
     @property
@@ -113,11 +112,6 @@ class TwinProblem(JointProblem):
         """Replays are slow: one form of each cause, and the decoys that are not forms of it."""
         known, forms = {"offset", "play", "friction", *SAG}, (None, "mass", "gain", "drift")
         return tuple(item for item in CATALOGUE if set(item.parameters) <= known and item.form in forms)
-
-    @override
-    def suspicions(self, selection: Selected, seed: int) -> list[Suspicion]:
-        """Replays know one delay of all commands: neither low-passes nor delays of single joints."""
-        return suspicions(selection)
 
     @override
     def with_one_delay(self, point: Point, joint: Array | None = None, theta: Array | None = None) -> Array:

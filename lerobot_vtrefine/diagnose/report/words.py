@@ -118,6 +118,8 @@ def headline(verdict: Verdict, unit: str) -> str:
     """The first sentence of the report."""
     names = listing([title(cause.name) for cause in verdict.causes])
     pairs = listing(ties(verdict))
+    clue = (verdict.unknown.clue or "").split(";")[0]
+    clue = f" Clue: {clue}." if 0 < len(clue) <= LONGEST_CLUE else ""
     if verdict.status == "invalid_data":
         return "No verdict is possible: too few of these recordings are usable."
     if verdict.status == "adequate":
@@ -128,13 +130,11 @@ def headline(verdict: Verdict, unit: str) -> str:
         )
     if verdict.status == "explained":
         said = withheld(verdict) if verdict.withheld else f"{repaired(verdict, unit)}{_unconfirmed(verdict)}"
-        return f"The simulation lacks {names}. {said}"
+        return f"The simulation lacks {names}. {said}{clue and ' It may be something else.'}{clue}"
     if verdict.status == "ambiguous":
         sure = [title(c.name) for c in verdict.causes if not any(c.name in g for g in verdict.ambiguous_with)]
         beside = f" It certainly lacks {listing(sure)}." if sure else ""
         return f"The simulation is wrong, but these recordings cannot tell whether it lacks {pairs}.{beside}"
-    clue = (verdict.unknown.clue or "").split(";")[0]
-    clue = f" Clue: {clue}." if 0 < len(clue) <= LONGEST_CLUE else ""
     symptoms = f" What looks like {names} may be a symptom of it.{_still_helps(verdict)}" if names else ""
     return f"The simulation is wrong in a way that no known cause explains.{clue}{symptoms}"
 
@@ -223,6 +223,8 @@ def doubts(verdict: Verdict, recorded: int, checked: int) -> list[str]:
     held = verdict.heldout
     if checked < recorded:
         found.append(f"Set aside: {recorded - checked} of {recorded} recordings, see Data below.")
+    if verdict.unknown.clue and not verdict.unknown.alarm:
+        found.append(f"It may be something else: {verdict.unknown.clue}.")
     if held is None:
         return found
     if len(held.trials) < 6:

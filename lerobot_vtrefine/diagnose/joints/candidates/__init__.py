@@ -23,6 +23,6 @@ NOT_SHOWN: dict[str, str] = {name: getattr(file, "NOT_SHOWN", "") for name, file
 """Why trials show nothing of a cause where no joint can."""
 
 
-def told_by_load(one: str, other: str) -> bool:
-    """Whether measured loads tell two causes apart: the servo pulls against one of them only."""
-    return {PLAIN[one].pulls, PLAIN[other].pulls} == {True, False}
+def told_by_load(one: Candidate, other: Candidate) -> bool:
+    """Whether measured loads tell two plain forms apart: the servo pulls against one of them only."""
+    return {one.pulls, other.pulls} == {True, False}
