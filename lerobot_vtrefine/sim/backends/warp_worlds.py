@@ -44,7 +44,7 @@ LONGEST = 40
 """Substeps in one graph: those of a control step. Launches of their own would leave gaps between them."""
 SIMPLEX = 5
 """Vertices with which the search for a penetration begins at most; it adds one an iteration."""
-COMPILING = "compiling kernels, once on this machine: a minute or two, about four for parts of meshes"
+COMPILING = "compiling kernels, once on this machine: a minute or two, about five for parts of meshes"
 SHARED = {CONTACTS: 4096, CONVEX: 1024}
 """Least room that worlds share, however few: on average they need little, but each at its worst, and episodes
 that start together come to it together. Pushed down its bore, a pin of 00446 makes up to 631 contacts of 175
