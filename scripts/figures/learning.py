@@ -8,6 +8,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from figures.common import BLUE, GREY, IMAGES, ORANGE, ROOT
+from lerobot_vtrefine.cli.results.paper_tables import practised
 from lerobot_vtrefine.cli.results.published import PAIRS
 from lerobot_vtrefine.cli.results.rows import IMITATION, TUNED, Run, read_all
 
@@ -88,23 +89,24 @@ def draw_rate(plt: Any) -> None:
 
 
 def draw_paper(plt: Any, table: str) -> None:
-    """A table's pairs: success while exploring, as judged afterwards, and as the paper has it."""
-    found = [row for row in read_all(ROOT / "results") if isinstance(row, Run) and row.table == table]
-    rows = [row for row in found if row.variant == TUNED]
+    """A table's pairs: success while exploring, as judged between and after, and as the paper has it."""
+    found = [row for row in read_all(ROOT / "results") if isinstance(row, Run)]
+    rows = practised(found) if table == "paper" else [row for row in found if row.table == table]
+    rows = [row for row in rows if row.variant == TUNED]
     pairs = sorted({row.task for row in rows})
     figure, (axes,) = plt.subplots(
         1, len(pairs), figsize=(4.4 * len(pairs), 3.6), sharey=True, layout="constrained", squeeze=False
     )
     for ax, task in zip(axes, pairs, strict=True):
         for row in (row for row in rows if row.task == task):
-            colour, points = POLICIES[row.policy], iterations(row)
-            at = [int(point["iteration"]) for point in points]
-            ax.plot(at, [100 * float(p["success"]) for p in points], color=colour, lw=1.2)
-            ax.plot(at[-1] + 1, 100 * row.success, "o", ms=5, color=colour)
+            colour, curve = POLICIES[row.policy], [100 * float(point["success"]) for point in iterations(row)]
+            end = row.iterations or len(curve)
+            ax.plot(range(end - len(curve), end), curve, color=colour, lw=1.2)
+            ax.plot(end, 100 * row.success, "o", ms=5, color=colour)
         for policy, colour in POLICIES.items():
             ax.axhline(100 * PAIRS[task][policy][TUNED], color=colour, ls="--", lw=0.8)
         ax.set_title(task, loc="left")
-        ax.set(xlabel="iteration of 1024 episodes", ylim=(0, 100))
+        ax.set(xlabel="iteration of 1024 episodes", ylim=(0, 102))
     axes[0].set_ylabel("success [%]")
     handles = [
         Patch(color=BLUE, label="vision and touch"),
@@ -119,8 +121,10 @@ def draw_paper(plt: Any, table: str) -> None:
 
 
 def iterations(row: Run) -> list[dict[str, str]]:
-    """A run's learning curve, without the evaluation before it."""
-    with (ROOT / "results" / str(row.curve)).open(encoding="utf-8") as file:
+    """A run's learning curve, without the evaluation before it; of one that another's curve holds none."""
+    if row.curve is None:
+        return []
+    with (ROOT / "results" / row.curve).open(encoding="utf-8") as file:
         return [point for point in csv.DictReader(file) if point["success"]]
 
 

@@ -18,6 +18,7 @@ from lerobot_vtrefine.cli.report.statistics import mean_interval, wilson_interva
 from lerobot_vtrefine.cli.results import provenance
 from lerobot_vtrefine.cli.results.cells import difference, over_seeds, pooled
 from lerobot_vtrefine.cli.results.collect import largest_fall, run_rows, save, steps_to
+from lerobot_vtrefine.cli.results.paper_tables import FURTHER, JUDGED_ANEW, practised
 from lerobot_vtrefine.cli.results.published import PAIRS, with_demonstrations
 from lerobot_vtrefine.cli.results.rows import (
     IMITATION,
@@ -291,6 +292,24 @@ def test_pairs_that_share_no_seed_have_no_mean() -> None:
         for policy in ("visual", "visuo_tactile")
     ]
     assert "mean of" not in table("paper", rows)
+
+
+def test_after_further_practice_stands_who_practised_longest_as_judged_last() -> None:
+    named = {"task": "automate/00446", "policy": "visuo_tactile", "episodes": 100}
+    tried = named | {"table": "tried"}
+    *_, first, last, gone_on = FURTHER
+    rows = [
+        run_of(0.9, 0, **tried, variant=gone_on, iterations=70),
+        run_of(0.5, 0, **named, table="paper", iterations=14),
+        run_of(0.6, 0, **tried, variant=last, iterations=42),
+        run_of(0.4, 1, **named, table="paper", iterations=14),
+        run_of(0.8, 1, **tried, variant=JUDGED_ANEW, iterations=14),
+        run_of(0.3, 2, **named, table="paper", iterations=14),
+        run_of(0.1, 2, **tried, variant=f"{last}, half the noise", iterations=42),
+        run_of(0.7, 2, **tried, variant=first, iterations=42),
+    ]
+    assert "| 80 [55, 100] (90, 80, 70) | 76 |" in table("paper_practised", rows)
+    assert [run.iterations for run in practised(rows)] == [14, 14, 14, 70, 42, 42]
 
 
 def test_fewer_demonstrations_stand_beside_the_papers() -> None:

@@ -1,8 +1,9 @@
 """Tables that set our figures beside the paper's own, from rows and from ``published``."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from statistics import mean
+from typing import Any
 
 from lerobot_vtrefine.cli.results.cells import (
     difference,
@@ -24,6 +25,17 @@ from lerobot_vtrefine.cli.results.rows import IMITATION, TUNED, Row, Run
 
 BESIDE = ("vision only", "the paper's", "touch", "the paper's", "touch minus vision", "the paper's")
 """Columns of the tables that stand beside the paper's."""
+FURTHER = tuple(
+    f"the paper's own network, {words}"
+    for words in (
+        *(f"{count} iterations more" for count in (14, 21, 28)),
+        "last practice",
+        "last practice gone on",
+    )
+)
+"""Variants among what was tried: policies of the paper's table that practised on."""
+JUDGED_ANEW = "the paper's own network, judged anew, both edges tried"
+"""The variant of those that were judged as they were, once the simulator had changed."""
 
 
 def paper_table(rows: Sequence[Run]) -> str:
@@ -46,6 +58,24 @@ def paper_table(rows: Sequence[Run]) -> str:
             theirs = {name: mean(values) for name, values in printed.items()}
             body.append([words, f"mean of {len(whole['visual'])}", *beside_the_paper(means, theirs)])
     return markdown(["", "pair", *BESIDE], body)
+
+
+def practised(rows: Sequence[Row], variants: Collection[str] = FURTHER) -> list[Run]:
+    """The paper's table after DPPO, and those of ``variants`` that went on from there, as rows of the table;
+    their iterations are counted from imitation on."""
+    runs = [row for row in rows if isinstance(row, Run)]
+    return [run for run in runs if run.table == "paper" and run.variant == TUNED] + [
+        replace(run, table="paper", variant=TUNED) for run in runs if run.variant in variants
+    ]
+
+
+def after_all_practice(rows: Sequence[Row]) -> list[Run]:
+    """Of every policy of the paper's table the one that practised longest, as it was judged last."""
+    latest: dict[tuple[Any, ...], Run] = {}
+    for run in practised(rows, (*FURTHER, JUDGED_ANEW)):
+        if run.key not in latest or (run.iterations or 0) >= (latest[run.key].iterations or 0):
+            latest[run.key] = run
+    return list(latest.values())
 
 
 def by_demonstrations(rows: Sequence[Row], suffix: str = "") -> list[Run]:

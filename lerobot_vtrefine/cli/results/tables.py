@@ -24,7 +24,12 @@ from lerobot_vtrefine.cli.results.cells import (
     pooled,
     values,
 )
-from lerobot_vtrefine.cli.results.paper_tables import by_demonstrations, demonstrations_table, paper_table
+from lerobot_vtrefine.cli.results.paper_tables import (
+    after_all_practice,
+    by_demonstrations,
+    demonstrations_table,
+    paper_table,
+)
 from lerobot_vtrefine.cli.results.rows import IMITATION, TUNED, Line, Row, Run
 
 BLOCK = re.compile(r"(<!-- table: (\w+) -->\n).*?(<!-- end -->)", re.DOTALL)
@@ -257,7 +262,7 @@ RENDERERS: dict[str, Callable[[Sequence], str]] = (
     | dict.fromkeys(Line.TABLES, lines_table)
     | {"demo": demo_table, "touch": touch_table, "reality": reality_table}
     | {"expert": expert_table, "policies": policies_table}
-    | dict.fromkeys(("paper", "paper_pads"), paper_table)
+    | dict.fromkeys(("paper", "paper_pads", "paper_practised"), paper_table)
     | dict.fromkeys(("demonstrations", "demonstrations_pads"), demonstrations_table)
     | {"handling": handling_table, "senses": senses_table}
     | {"reference": reference_table}
@@ -266,6 +271,7 @@ RENDERERS: dict[str, Callable[[Sequence], str]] = (
 DERIVED: dict[str, Callable[[Sequence[Row]], list[Run]]] = {
     "handling": measured,
     "senses": converging,
+    "paper_practised": after_all_practice,
     "demonstrations": by_demonstrations,
     "demonstrations_pads": partial(by_demonstrations, suffix="_pads"),
 }
