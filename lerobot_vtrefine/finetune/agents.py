@@ -10,6 +10,14 @@ from lerobot_vtrefine.finetune.protocols import Agent
 from lerobot_vtrefine.policies.vt_dp3.configuration_vt_dp3 import VtDp3Config
 from lerobot_vtrefine.policies.vt_dp3.modeling_vt_dp3 import VtDp3Policy
 
+CHAIN = {
+    "sampler": "sampler",
+    "sampler_steps": "num_inference_steps",
+    "prefix_steps": "prefix_steps",
+    "ft_denoising_steps": "ft_denoising_steps",
+}
+"""Settings of ``dppo`` that say which denoising steps are tuned, and a policy's own names for them."""
+
 
 def load_policy(path: Path, overrides: list[str] | None = None) -> VtDp3Policy:
     """Load a ``vt_dp3`` checkpoint with these flags, by default the command line's ``--policy.*``.
@@ -42,14 +50,8 @@ def make_agent(policy: VtDp3Policy, dppo: DppoConfig) -> Agent:
     A pre-trained policy is made ready for DPPO first; a checkpoint of a DPPO run is so already.
     """
     if not policy.config.ft_denoising_steps:
-        policy.prepare_finetuning(
-            sampler=dppo.sampler,
-            num_inference_steps=dppo.sampler_steps,
-            prefix_steps=dppo.prefix_steps,
-            ft_denoising_steps=dppo.ft_denoising_steps,
-            eta=dppo.deploy_eta,
-            freeze_encoder=dppo.encoder == "frozen",
-        )
+        chain = {own: getattr(dppo, name) for name, own in CHAIN.items()}
+        policy.prepare_finetuning(**chain, eta=dppo.deploy_eta, freeze_encoder=dppo.encoder == "frozen")
     policy.eval()
     config = policy.config
     if policy.base is None:
@@ -69,13 +71,8 @@ def make_agent(policy: VtDp3Policy, dppo: DppoConfig) -> Agent:
 
 def check_same_chain(dppo: DppoConfig, policy: VtDp3Config) -> None:
     """Raises: ValueError where a new run would tune other denoising steps than the policy's networks do."""
-    kept = {
-        "sampler": policy.sampler,
-        "sampler_steps": policy.num_inference_steps,
-        "prefix_steps": policy.prefix_steps,
-        "ft_denoising_steps": policy.ft_denoising_steps,
-        "encoder": "frozen" if policy.ft_freeze_encoder else "trained",
-    }
+    kept = {name: getattr(policy, own) for name, own in CHAIN.items()}
+    kept["encoder"] = "frozen" if policy.ft_freeze_encoder else "trained"
     if given := [f"--dppo.{name}={value}" for name, value in kept.items() if getattr(dppo, name) != value]:
         raise ValueError(
             f"--policy.path is fine-tuned already: go on with its networks by {' '.join(given)}, or start"

@@ -31,6 +31,8 @@ from lerobot_vtrefine.lerobot_compat.claim import Claim
 from lerobot_vtrefine.wording import plural
 
 STATE_NAME = "dppo_state.safetensors"
+PARTS = ("critic", "actor_optimizer", "critic_optimizer", "reward_scaler", "trust_region")
+"""Of `TrainState`: what has a ``state_dict``."""
 
 
 @dataclass
@@ -105,7 +107,9 @@ def save_checkpoint(output_dir: Path, saveable: Saveable, state: TrainState, tot
         shutil.rmtree(partial, ignore_errors=True)
         saveable.save(partial / PRETRAINED_MODEL_DIR)
         (partial / TRAINING_STATE_DIR).mkdir()
-        save_state(_state_dict(state) | {"ranks": ranks}, partial / TRAINING_STATE_DIR / STATE_NAME)
+        parts = {part: getattr(state, part).state_dict() for part in PARTS}
+        counts = {"iteration": state.iteration, "env_steps": state.env_steps}
+        save_state({**parts, **counts, "ranks": ranks}, partial / TRAINING_STATE_DIR / STATE_NAME)
         flush(partial)  # or a power failure could leave the name and empty files
         shutil.rmtree(final, ignore_errors=True)
         partial.rename(final)
@@ -129,29 +133,14 @@ def load_training_state(checkpoint: Path, state: TrainState) -> None:
         raise ValueError(
             f"{checkpoint} was written by {plural(len(saved['ranks']), 'process')}: resume with as many"
         )
-    state.critic.load_state_dict(saved["critic"])
-    state.actor_optimizer.load_state_dict(saved["actor_optimizer"])
-    state.critic_optimizer.load_state_dict(saved["critic_optimizer"])
-    state.reward_scaler.load_state_dict(saved["reward_scaler"])
-    state.trust_region.load_state_dict(saved["trust_region"])
+    for part in PARTS:
+        getattr(state, part).load_state_dict(saved[part])
     state.iteration, state.env_steps = saved["iteration"], saved["env_steps"]
     if rank_index() == 0:
         point_last_at(checkpoint)
     own = saved["ranks"][rank_index()]
     state.generator.set_state(own["generator"])
     deserialize_rng_state(own["global"])
-
-
-def _state_dict(state: TrainState) -> dict[str, Any]:
-    return {
-        "critic": state.critic.state_dict(),
-        "actor_optimizer": state.actor_optimizer.state_dict(),
-        "critic_optimizer": state.critic_optimizer.state_dict(),
-        "reward_scaler": state.reward_scaler.state_dict(),
-        "trust_region": state.trust_region.state_dict(),
-        "iteration": state.iteration,
-        "env_steps": state.env_steps,
-    }
 
 
 def _random_states(state: TrainState) -> dict[str, Any]:

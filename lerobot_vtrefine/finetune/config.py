@@ -13,6 +13,11 @@ TIMEOUTS = ("terminal", "bootstrap")
 ENCODERS = ("trained", "frozen")
 MIN_LOG_PROB_STD = 0.055
 """Where a Gaussian's peak density reaches the upper end of diffusion.LOG_PROB_RANGE."""
+POSITIVE = (
+    *("iterations", "num_envs", "ft_denoising_steps", "epochs", "minibatch_decisions"),
+    *("clip", "clip_first", "gamma", "actor_lr", "critic_lr"),
+)
+"""Settings that must be above 0."""
 NOT_NEGATIVE = (
     *("decisions", "minibatches", "micro_batch_decisions", "critic_warmup", "lr_warmup"),
     *("actor_lr_final", "actor_lr_max", "critic_lr_final", "weight_decay", "max_grad_norm"),
@@ -134,16 +139,7 @@ class DppoConfig(draccus.ChoiceRegistry):
         for name in ("gamma", "gae_lambda", "gamma_denoising"):
             if not 0.0 <= getattr(self, name) <= 1.0:
                 raise ValueError(f"--dppo.{name} must lie in [0, 1], got {getattr(self, name)}")
-        positive = (
-            "iterations",
-            "num_envs",
-            "ft_denoising_steps",
-            "epochs",
-            "minibatch_decisions",
-            "clip",
-            "clip_first",
-        )
-        for name in (*positive, "gamma", "actor_lr", "critic_lr"):
+        for name in POSITIVE:
             if getattr(self, name) <= 0:
                 raise ValueError(f"--dppo.{name} must be positive, got {getattr(self, name)}")
         if not 0.0 <= self.eta <= 1.0:

@@ -21,7 +21,7 @@ from tqdm import tqdm
 from lerobot_vtrefine.envs.config import VtRefineEnvConfig
 from lerobot_vtrefine.envs.decisions import LeRobotDecisionEnv, make_decision_env
 from lerobot_vtrefine.files import read_json, read_yaml
-from lerobot_vtrefine.finetune.agents import check_same_chain, load_policy, make_agent
+from lerobot_vtrefine.finetune.agents import CHAIN, check_same_chain, load_policy, make_agent
 from lerobot_vtrefine.finetune.checkpoint import (
     Saveable,
     claimed,
@@ -61,10 +61,7 @@ SHOWN = (
     "steps_per_s",
 )
 """Metrics that the log tells after every iteration; progress.csv has all."""
-MADE_WITH = (
-    *("sampler", "sampler_steps", "prefix_steps", "ft_denoising_steps", "eta", "encoder"),
-    *("critic_width", "critic_blocks", "num_envs"),
-)
+MADE_WITH = (*CHAIN, "eta", "encoder", "critic_width", "critic_blocks", "num_envs")
 """Settings of ``dppo`` that a checkpoint's networks, and how its policy acts, were made with; and by which
 episodes are counted, of which none is to come twice."""
 
@@ -209,6 +206,11 @@ def make_practice(policy: VtDp3Policy, path: Path, env: EnvConfig, dppo: DppoCon
     return Practice(policy, agent, make_decision_env(env, dppo.num_envs, *processors, *windows), processors)
 
 
+def env_of(task: Path) -> VtRefineEnvConfig:
+    """The environment of a file as in configs/env. Raises: ValueError for another environment type."""
+    return checked_env(draccus.decode(EnvConfig, read_yaml(task)["env"]))
+
+
 def env_on(
     device: str, task: Path, backend: str | None = None, timestep_s: float | None = None, **fields: Any
 ) -> VtRefineEnvConfig:
@@ -219,7 +221,7 @@ def env_on(
 
     Raises: ValueError for another environment type.
     """
-    env = checked_env(draccus.decode(EnvConfig, read_yaml(task)["env"]))
+    env = env_of(task)
     backend = backend or (env.backend if device == "cpu" else "warp")
     scene = replace(env.scene, timestep_s=timestep_s or env.scene.timestep_s)
     return replace(env, backend=backend, warp=replace(env.warp, device=device), scene=scene, **fields)
