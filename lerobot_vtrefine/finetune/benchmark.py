@@ -7,15 +7,14 @@ steps on the same number of rows.
 
 import time
 from collections.abc import Callable
-from copy import deepcopy
 from dataclasses import replace
 
 import torch
-from lerobot.configs import FeatureType, PolicyFeature
 from torch import Tensor
 
-from lerobot_vtrefine.datasets.features import ACTION_KEY, CLOUD_KEY, STATE_KEY
-from lerobot_vtrefine.embodiments import DEFAULT_BODY, get_embodiment
+from lerobot_vtrefine.datasets.features import CLOUD_KEY, STATE_KEY
+from lerobot_vtrefine.finetune.agents import make_agent
+from lerobot_vtrefine.finetune.benchmark_busy import random_policy
 from lerobot_vtrefine.finetune.chains import chain_log_probs
 from lerobot_vtrefine.finetune.config import SmallDppo
 from lerobot_vtrefine.finetune.dppo import (
@@ -25,15 +24,13 @@ from lerobot_vtrefine.finetune.dppo import (
     policy_loss,
     update,
 )
-from lerobot_vtrefine.finetune.protocols import Agent, no_gradient, select
+from lerobot_vtrefine.finetune.protocols import Agent, select
 from lerobot_vtrefine.observation import num_points
 from lerobot_vtrefine.policies.vt_dp3.configuration_vt_dp3 import VtDp3Config
-from lerobot_vtrefine.policies.vt_dp3.diffusion import DiffusionProcess, slice_log_prob, step_grid
-from lerobot_vtrefine.policies.vt_dp3.modeling_vt_dp3 import VtDp3Model
+from lerobot_vtrefine.policies.vt_dp3.diffusion import slice_log_prob
 
 DECISIONS = 64
 PRIVILEGED = 60
-NUM_JOINTS = get_embodiment(DEFAULT_BODY).num_joints
 ROUNDS = 3
 
 Row = tuple[str, float, str]
@@ -54,9 +51,10 @@ def _row(encoder: str) -> Row:
         kl_per_decision=0.0,  # both loops do all their steps
         kl_per_decision_final=0.0,
     )
-    agent = _agent(cfg)
+    policy = random_policy()
+    agent = make_agent(policy, cfg)
     state = TrainState.create(agent, cfg, PRIVILEGED, seed=0)
-    rollout = _rollout(agent, cfg)
+    rollout = _rollout(policy.config, agent, cfg)
     ours, plain = [], []
     for _ in range(ROUNDS + 1):  # by turns; the first round warms up
         ours.append(_seconds(lambda: update(_for_update(rollout, agent), agent, state, cfg)))
@@ -72,33 +70,12 @@ def _seconds(function: Callable[[], object]) -> float:
     return time.process_time() - started
 
 
-def _agent(cfg: SmallDppo) -> Agent:
-    config = VtDp3Config(preset="small", device="cpu")
-    config.input_features = {STATE_KEY: PolicyFeature(FeatureType.STATE, (NUM_JOINTS,))}
-    config.output_features = {ACTION_KEY: PolicyFeature(FeatureType.ACTION, (NUM_JOINTS,))}
-    torch.manual_seed(0)
-    actor = VtDp3Model(config, NUM_JOINTS, NUM_JOINTS)
-    actor.encoder.requires_grad_(cfg.encoder == "trained")
-    grid = step_grid(cfg.sampler, config.num_train_timesteps, cfg.sampler_steps, cfg.prefix_steps)
-    return Agent(
-        actor=actor,
-        base=no_gradient(deepcopy(actor)),
-        process=DiffusionProcess(config.num_train_timesteps, grid),
-        num_tuned=cfg.ft_denoising_steps,
-        action_shape=(config.horizon, NUM_JOINTS),
-        executed=slice(0, config.n_action_steps),
-        frozen_encoder=cfg.encoder == "frozen",
-        deploy_eta=cfg.deploy_eta,
-    )
-
-
 @torch.no_grad()
-def _rollout(agent: Agent, cfg: SmallDppo) -> Rollout:
+def _rollout(config: VtDp3Config, agent: Agent, cfg: SmallDppo) -> Rollout:
     """One random decision in each of ``DECISIONS`` environments, with raw observations."""
-    config = VtDp3Config(preset="small", device="cpu")
     points = num_points(config.observation)
     obs = {
-        STATE_KEY: torch.randn(DECISIONS, config.n_obs_steps, NUM_JOINTS),
+        STATE_KEY: torch.randn(DECISIONS, config.n_obs_steps, config.state_dim),
         CLOUD_KEY: torch.rand(DECISIONS, config.n_obs_steps, points, 5),
     }
     latents = 0.5 * torch.randn(DECISIONS, cfg.ft_denoising_steps + 1, *agent.action_shape)

@@ -16,7 +16,6 @@ import torch
 from lerobot.envs.utils import env_to_policy_features
 
 from lerobot_vtrefine.datasets.features import ACTION_KEY, STATE_KEY
-from lerobot_vtrefine.embodiments import DEFAULT_BODY, get_embodiment
 from lerobot_vtrefine.envs.config import VtRefineEnvConfig
 from lerobot_vtrefine.envs.decisions import LeRobotDecisionEnv, make_decision_env
 from lerobot_vtrefine.finetune.agents import make_agent
@@ -30,7 +29,6 @@ from lerobot_vtrefine.policies.vt_dp3.processor_vt_dp3 import make_vt_dp3_pre_po
 Row = tuple[str, float, str]
 
 CORES = 2
-NUM_JOINTS = get_embodiment(DEFAULT_BODY).num_joints
 LOWEST_PRIORITY = 19
 SPIN = f"import os; os.nice({LOWEST_PRIORITY})\nwhile True: pass"
 SETTLE_S = 0.5
@@ -52,9 +50,11 @@ class Iteration:
         cfg = SmallDppo(
             num_envs=num_envs, decisions=2, encoder="frozen", minibatch_decisions=num_envs, critic_warmup=0
         )
-        torch.manual_seed(0)
-        policy, processors = _policy()
+        policy = random_policy()
         agent = make_agent(policy, cfg)
+        bounds = {"min": -torch.ones(policy.config.state_dim), "max": torch.ones(policy.config.state_dim)}
+        stats = {STATE_KEY: bounds, ACTION_KEY: bounds}
+        processors = make_vt_dp3_pre_post_processors(policy.config, stats)
         task = VtRefineEnvConfig(start="grasped")
         windows = policy.config.n_obs_steps, policy.config.n_action_steps
         env = make_decision_env(task, num_envs, *processors, *windows)
@@ -112,13 +112,11 @@ def busy_process() -> Generator[None]:
         other.wait()
 
 
-def _policy() -> tuple[VtDp3Policy, tuple]:
-    """A policy of the preset ``small`` as behaviour cloning leaves it, and its processors."""
+def random_policy() -> VtDp3Policy:
+    """A policy of the preset ``small`` with random weights, as behaviour cloning would leave it."""
     config = VtDp3Config(preset="small", device="cpu")
     features = env_to_policy_features(VtRefineEnvConfig())
     config.input_features = {key: features[key] for key in config.required_keys}
     config.output_features = {ACTION_KEY: features[ACTION_KEY]}
-    bounds = {"min": -torch.ones(NUM_JOINTS), "max": torch.ones(NUM_JOINTS)}
-    return VtDp3Policy(config), make_vt_dp3_pre_post_processors(
-        config, {STATE_KEY: bounds, ACTION_KEY: bounds}
-    )
+    torch.manual_seed(0)
+    return VtDp3Policy(config)

@@ -9,11 +9,12 @@ import torch
 from torch import Tensor
 
 from lerobot_vtrefine.finetune.config import DppoConfig
-from lerobot_vtrefine.finetune.protocols import Actor, Agent, Observation, predictor, select
+from lerobot_vtrefine.finetune.protocols import Actor, Agent, Observation, select
 from lerobot_vtrefine.policies.vt_dp3.diffusion import (
     Chain,
     PredictNoise,
     denoise_prefix,
+    predictor,
     sample_chain,
     slice_log_prob,
     whiten,
@@ -66,7 +67,7 @@ class Regulariser:
                 means.append(_reverse_steps(agent, agent.base, latents[ids], cond, cfg.eta)[0])
             if cfg.bc_coef:
                 noise = torch.randn((len(ids), *agent.action_shape), generator=generator, device=cond.device)
-                base = predictor(agent.base, cond)
+                base = predictor(agent.base.denoiser, cond)
                 start = denoise_prefix(agent.process, base, noise, agent.num_tuned)
                 chains.append(explore(agent, base, start, cfg, generator).latents)
         return cls(torch.cat(means) if means else None, torch.cat(chains) if chains else None)
@@ -103,9 +104,7 @@ def chain_log_probs(
 
 
 @torch.no_grad()
-def decision_kl(
-    old_mean: Tensor, mean: Tensor, std: Tensor, executed: slice, correlation: float = 0.0
-) -> Tensor:
+def decision_kl(old_mean: Tensor, mean: Tensor, std: Tensor, executed: slice, correlation: float) -> Tensor:
     """KL divergence (B,) [nats] of whole decisions between two policies that share their noise.
 
     old_mean, mean (B, K', H, D); std broadcastable to them. Exact for Gaussian steps of these deviations: the

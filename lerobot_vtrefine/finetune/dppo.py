@@ -47,13 +47,12 @@ from lerobot_vtrefine.finetune.protocols import (
     concatenate,
     execute,
     latest,
-    predictor,
     select,
     start,
 )
 from lerobot_vtrefine.finetune.seeds import TRAINING_SEEDS
 from lerobot_vtrefine.finetune.trust_region import TrustRegion
-from lerobot_vtrefine.policies.vt_dp3.diffusion import denoise_prefix
+from lerobot_vtrefine.policies.vt_dp3.diffusion import denoise_prefix, predictor
 
 Metrics = dict[str, float]
 MINIBATCH_METRICS = ("value_loss", "policy_loss", "approx_kl", "clip_fraction", "log_ratio", "decision_kl")
@@ -126,8 +125,9 @@ def collect(
         obs = select(obs, ids)
         cond, cond_base = agent.conditions(obs)
         noise = torch.randn((len(ids), *agent.action_shape), generator=generator, device=device)
-        latent = denoise_prefix(agent.process, predictor(agent.base, cond_base), noise, agent.num_tuned)
-        chain = explore(agent, predictor(agent.actor, cond), latent, cfg, generator)
+        base, actor = predictor(agent.base.denoiser, cond_base), predictor(agent.actor.denoiser, cond)
+        latent = denoise_prefix(agent.process, base, noise, agent.num_tuned)
+        chain = explore(agent, actor, latent, cfg, generator)
         transition = execute(env, chain.latents[:, -1, agent.executed], ids)
         kept.append({"cond": cond} if agent.frozen_encoder else obs)
         chains.append(chain)
@@ -193,15 +193,17 @@ def decision_advantages(rollout: Rollout, state: TrainState, cfg: DppoConfig) ->
     return (advantages - mean) / (std + 1e-8), targets
 
 
+def clip_ranges(like: Tensor, cfg: DppoConfig) -> Tensor:
+    """(K',) clip range of every tuned step; device and type as of ``like``."""
+    return like.new_tensor([cfg.clip_range(step) for step in range(cfg.ft_denoising_steps)])
+
+
 def policy_loss(log_ratio: Tensor, advantages: Tensor, cfg: DppoConfig) -> Tensor:
     """PPO's clipped loss per row. log_ratio (B, K'), advantages (B,) -> (B, K')."""
-    steps = range(cfg.ft_denoising_steps)
-    clip = log_ratio.new_tensor([cfg.clip_range(step) for step in steps])
-    discount = log_ratio.new_tensor(
-        [cfg.gamma_denoising ** (cfg.ft_denoising_steps - 1 - step) for step in steps]
-    )
+    steps_left = range(cfg.ft_denoising_steps - 1, -1, -1)
+    discount = log_ratio.new_tensor([cfg.gamma_denoising**left for left in steps_left])
     advantages = advantages.unsqueeze(1) * discount
-    ratio = log_ratio.exp()
+    ratio, clip = log_ratio.exp(), clip_ranges(log_ratio, cfg)
     clipped = ratio.clamp(1 - clip, 1 + clip)
     return torch.maximum(-advantages * ratio, -advantages * clipped)
 
@@ -217,8 +219,7 @@ class Minibatches:
         self.regulariser = Regulariser()
         if self.train_actor:
             self.regulariser = Regulariser.of(rollout.obs, rollout.latents, agent, cfg, state.generator)
-        steps = range(cfg.ft_denoising_steps)
-        self.clip = self.advantages.new_tensor([cfg.clip_range(step) for step in steps])
+        self.clip = clip_ranges(self.advantages, cfg)
         # Ranks own different numbers of decisions: as many minibatches everywhere, of unequal sizes.
         most = max_over_ranks(len(self.advantages), self.advantages.device)
         self.per_epoch = min(cfg.minibatches or math.ceil(most / cfg.minibatch_decisions), most)

@@ -10,12 +10,11 @@ from lerobot_vtrefine.finetune.protocols import (
     DecisionEnv,
     execute,
     latest,
-    predictor,
     select,
     start,
 )
 from lerobot_vtrefine.finetune.seeds import EVALUATION_SEEDS
-from lerobot_vtrefine.policies.vt_dp3.diffusion import deploy
+from lerobot_vtrefine.policies.vt_dp3.diffusion import deploy, predictor
 
 
 @torch.no_grad()
@@ -63,10 +62,10 @@ def deployed_chunks(agent: Agent, cond: Tensor, cond_base: Tensor, generator: to
     noise = torch.randn((len(cond), *agent.action_shape), generator=generator, device=cond.device)
     chunks = deploy(
         agent.process,
-        predictor(agent.actor, cond),
+        predictor(agent.actor.denoiser, cond),
         noise,
         num_tuned=agent.num_tuned,
-        predict_noise_base=predictor(agent.base, cond_base),
+        predict_noise_base=predictor(agent.base.denoiser, cond_base),
         eta=agent.deploy_eta,
         correlation=agent.deploy_correlation,
         generator=generator,

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from lerobot_vtrefine.envs.decisions import Decision
-from lerobot_vtrefine.policies.vt_dp3.diffusion import DiffusionProcess, PredictNoise
+from lerobot_vtrefine.policies.vt_dp3.diffusion import DiffusionProcess
 
 Observation = dict[str, Tensor]
 """A preprocessed policy batch; every tensor starts with the environment axis."""
@@ -70,11 +70,6 @@ class Agent:
         return cond, (cond if self.frozen_encoder else self.base.encode(obs))
 
 
-def predictor(network: Actor, cond: Tensor) -> PredictNoise:
-    """Bind a condition to a network's denoiser."""
-    return lambda x, t: network.denoiser(x, t, cond)
-
-
 class DecisionEnv(Protocol):
     """Environments that take one action chunk per decision and pause once finished, until the next reset.
 
@@ -104,12 +99,6 @@ class DecisionEnv(Protocol):
     def step_chunk(self, actions: Tensor) -> Decision:
         """Execute (n, Ta, D) normalised actions, as the policy predicts them."""
         ...
-
-
-def no_gradient[M: nn.Module](module: M) -> M:
-    """Freeze a module in place."""
-    module.requires_grad_(False)
-    return module.eval()
 
 
 def select(obs: Observation, index: Tensor) -> Observation:

@@ -16,11 +16,11 @@ from torch import nn
 
 from lerobot_vtrefine.finetune.chains import chain_log_probs, explore
 from lerobot_vtrefine.finetune.config import DppoConfig
-from lerobot_vtrefine.finetune.protocols import predictor
 from lerobot_vtrefine.finetune.seeds import EVALUATION_SEEDS, TRAINING_SEEDS
 from lerobot_vtrefine.policies.vt_dp3.diffusion import (
     DiffusionProcess,
     denoise_prefix,
+    predictor,
     squaredcos_alpha_bar,
     step_grid,
 )
@@ -143,8 +143,8 @@ def test_chains_have_the_densities_of_ddpm() -> None:
     generator = torch.Generator().manual_seed(0)
     cond = torch.randn(5, OBS_DIM, generator=generator)
     noise = torch.randn((5, *agent.action_shape), generator=generator)
-    start = denoise_prefix(agent.process, predictor(agent.base, cond), noise, TUNED_STEPS)
-    chain = explore(agent, predictor(agent.actor, cond), start, cfg, generator)
+    start = denoise_prefix(agent.process, predictor(agent.base.denoiser, cond), noise, TUNED_STEPS)
+    chain = explore(agent, predictor(agent.actor.denoiser, cond), start, cfg, generator)
     ours, _, _ = chain_log_probs(agent, chain.latents, cond, cfg)
     torch.testing.assert_close(ours, chain.log_probs)
 

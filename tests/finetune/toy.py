@@ -7,7 +7,7 @@ from torch import Tensor, nn
 
 from lerobot_vtrefine.envs.decisions import Decision
 from lerobot_vtrefine.finetune.config import DppoConfig
-from lerobot_vtrefine.finetune.protocols import Agent, Observation, no_gradient
+from lerobot_vtrefine.finetune.protocols import Agent, Observation
 from lerobot_vtrefine.policies.vt_dp3.diffusion import DiffusionProcess, step_grid
 
 
@@ -54,7 +54,7 @@ def make_agent(
     frozen = cfg.encoder == "frozen"
     if frozen:
         base.encoder = actor.encoder
-    no_gradient(base)
+    base.requires_grad_(False).eval()
     executed = slice(0, action_shape[0])
     tuned = cfg.ft_denoising_steps
     return Agent(actor, base, process, tuned, action_shape, executed, frozen, cfg.deploy_eta)

@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from lerobot_vtrefine.choices import check_choice
 
@@ -26,7 +26,12 @@ NOISE_CLIP = 3.0  # DPPO's randn_clip_value: one sample never moves a latent by 
 LOG_PROB_RANGE = (-5.0, 2.0)  # DPPO clamps each element's log-probability before averaging
 
 PredictNoise = Callable[[Tensor, Tensor], Tensor]
-"""``(x (B, H, D), t (B,) long) -> eps (B, H, D)``; the condition is bound by the caller."""
+"""``(x (B, H, D), t (B,) long) -> eps (B, H, D)``; the condition is bound, as by `predictor`."""
+
+
+def predictor(denoiser: nn.Module, cond: Tensor) -> PredictNoise:
+    """A denoiser with its condition bound."""
+    return lambda x, t: denoiser(x, t, cond)
 
 
 def squaredcos_alpha_bar(num_train_steps: int) -> Tensor:

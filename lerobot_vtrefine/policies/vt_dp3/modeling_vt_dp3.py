@@ -22,7 +22,7 @@ from lerobot_vtrefine.envs.config import EnvAction
 from lerobot_vtrefine.files.weights import naming_full_disk
 from lerobot_vtrefine.policies.vt_dp3.configuration_vt_dp3 import VtDp3Config
 from lerobot_vtrefine.policies.vt_dp3.denoisers import MLPDenoiser, UNetDenoiser
-from lerobot_vtrefine.policies.vt_dp3.diffusion import DiffusionProcess, PredictNoise, deploy
+from lerobot_vtrefine.policies.vt_dp3.diffusion import DiffusionProcess, PredictNoise, deploy, predictor
 from lerobot_vtrefine.policies.vt_dp3.ema import Ema
 from lerobot_vtrefine.policies.vt_dp3.observation_encoder import PERCEIVED_KEY, load_encoder, make_encoder
 from lerobot_vtrefine.policies.vt_dp3.processor_vt_dp3 import check_stats, widen_narrow_ranges
@@ -33,10 +33,10 @@ Batch = dict[str, Tensor]
 class VtDp3Model(nn.Module):
     """Observation encoder and noise predictor."""
 
-    def __init__(self, config: VtDp3Config, state_dim: int, action_dim: int) -> None:
+    def __init__(self, config: VtDp3Config) -> None:
         super().__init__()
-        self.encoder = make_encoder(config, state_dim)
-        cond_dim = self.encoder.cond_dim
+        self.encoder = make_encoder(config, config.state_dim)
+        cond_dim, action_dim = self.encoder.cond_dim, config.action_dim
         if config.denoiser == "unet":
             self.denoiser: nn.Module = UNetDenoiser(
                 action_dim, cond_dim, config.down_dims, config.kernel_size, config.time_dim
@@ -56,10 +56,6 @@ class VtDp3Model(nn.Module):
     def encode(self, batch: Batch) -> Tensor:
         """Columns ``encoder.keys`` (B, To, ...) of a processed batch -> condition (B, C)."""
         return self.encoder(batch)
-
-    def predictor(self, cond: Tensor) -> PredictNoise:
-        """The noise predictor with its condition bound."""
-        return lambda x, t: self.denoiser(x, t, cond)
 
 
 class AuxiliaryHead(nn.Sequential):
@@ -111,7 +107,7 @@ class VtDp3Policy(PreTrainedPolicy):
             # hook.
             widen_narrow_ranges(dataset_stats)
         self.config: VtDp3Config = config
-        self.model = VtDp3Model(config, config.state_dim, config.action_dim)
+        self.model = VtDp3Model(config)
         if read_encoder and config.pretrained_encoder:
             load_encoder(self.model.encoder, config)
         self.base: VtDp3Model | None = None
@@ -329,10 +325,11 @@ class VtDp3Policy(PreTrainedPolicy):
             noise = torch.randn(shape, generator=generator, device=cond.device, dtype=cond.dtype)
         base: PredictNoise | None = None
         if self.base is not None:
-            base = self.base.predictor(cond if self.config.ft_freeze_encoder else self.base.encode(batch))
+            cond_base = cond if self.config.ft_freeze_encoder else self.base.encode(batch)
+            base = predictor(self.base.denoiser, cond_base)
         return deploy(
             self.process,
-            self.model.predictor(cond),
+            predictor(self.model.denoiser, cond),
             noise,
             num_tuned=self.config.ft_denoising_steps,
             predict_noise_base=base,

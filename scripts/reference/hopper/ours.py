@@ -18,7 +18,7 @@ from lerobot_vtrefine.envs.decisions import Decision
 from lerobot_vtrefine.finetune import dppo
 from lerobot_vtrefine.finetune.config import DppoConfig
 from lerobot_vtrefine.finetune.evaluation import evaluate
-from lerobot_vtrefine.finetune.protocols import Agent, Observation, no_gradient
+from lerobot_vtrefine.finetune.protocols import Agent, Observation
 from lerobot_vtrefine.policies.vt_dp3.diffusion import DiffusionProcess, step_grid
 from reference.checkout import Reference
 from reference.hopper.curves import Curve
@@ -140,7 +140,7 @@ def hopper_agent(tuned: nn.Module, base: nn.Module, deploy_eta: float) -> Agent:
     grid = step_grid("ddpm", DENOISING_STEPS, DENOISING_STEPS)
     return Agent(
         actor=StateActor(tuned),
-        base=no_gradient(StateActor(base)),
+        base=StateActor(base).requires_grad_(False).eval(),
         process=DiffusionProcess(DENOISING_STEPS, grid),
         num_tuned=TUNED_STEPS,
         action_shape=(CHUNK, ACTION_DIM),

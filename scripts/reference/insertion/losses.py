@@ -110,14 +110,14 @@ def compare(
         torch.cat([part.flatten() for part in torch.autograd.grad(value, own)])
         for value, own in zip((loss, theirs[0]), weights, strict=True)
     ]
-    clip = log_ratio.new_tensor([cfg.clip_range(step) for step in range(batch.agent.num_tuned)])
+    clipped = log_ratio.expm1().abs() > dppo.clip_ranges(log_ratio, cfg)
     pairs = {
         "log-probability when sampled": (old, batch.sliced(old_theirs)),
         "log-probability now": (now, batch.sliced(now_theirs)),
         "policy loss": (loss, theirs[0]),
         "gradient of the policy loss": gradients,
         "value loss": (0.5 * (values - batch.returns).square().mean(), theirs[2]),
-        "clip fraction": ((log_ratio.expm1().abs() > clip).double().mean(), loss.new_tensor(theirs[3])),
+        "clip fraction": (clipped.double().mean(), loss.new_tensor(theirs[3])),
         "approx_kl": ((log_ratio.expm1() - log_ratio).mean(), loss.new_tensor(theirs[4])),
     }
     return {
