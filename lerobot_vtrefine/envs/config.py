@@ -151,9 +151,7 @@ class VtRefineEnvConfig(EnvConfig):
                 raise ValueError(f"--env.rgb_size must be at least {SMALLEST_PX} pixels, got {self.rgb_size}")
             if self.ablate == "vision":
                 raise ValueError("--env.ablate=vision hides the depth image only: leave out --env.rgb=true")
-        self.features = policy_features(
-            *self.camera_size, self.body, self.fps, self.colour_size, self.limited
-        )
+        self.features = self._policy_features()
         self.features_map = env_key_map(self.body, colour=self.rgb, limited=self.limited)
         _ = self.task_config  # its own checks, now rather than in a worker process
 
@@ -227,27 +225,18 @@ class VtRefineEnvConfig(EnvConfig):
 
         return {self.type: {0: make_vector_env(self, n_envs, use_async_envs)}}
 
+    def _policy_features(self) -> dict[str, PolicyFeature]:
+        """LeRobot features under environment keys.
 
-def policy_features(
-    camera_height: int,
-    camera_width: int,
-    body: Embodiment,
-    fps: int,
-    colour: tuple[int, int] | None = None,
-    limited: bool = False,
-) -> dict[str, PolicyFeature]:
-    """LeRobot features under environment keys, with `fps` actions a second; `colour` is the colour image's
-    height and width, `limited` whether they hold limits.
-
-    Depth is not a VISUAL feature here: ``lerobot-eval --eval.recording=true`` makes videos of these, and
-    millimetres do not fit into one.
-    """
-    shapes = env_observation_shapes(camera_height, camera_width, body, limited)
-    kinds = {LIMITS_KEY.removeprefix(OBS_PREFIX): FeatureType.ENV}
-    features = {
-        key: PolicyFeature(type=kinds.get(key, FeatureType.STATE), shape=shape)
-        for key, (shape, _) in shapes.items()
-    }
-    if colour is not None:
-        features[RGB_KEY] = PolicyFeature(type=FeatureType.VISUAL, shape=(*colour, 3))
-    return {ACTION_KEY: EnvAction.of(body, fps), **features}
+        Depth is not a VISUAL feature here: ``lerobot-eval --eval.recording=true`` makes videos of these, and
+        millimetres do not fit into one.
+        """
+        shapes = env_observation_shapes(*self.camera_size, self.body, self.limited)
+        kinds = {LIMITS_KEY.removeprefix(OBS_PREFIX): FeatureType.ENV}
+        features = {
+            key: PolicyFeature(type=kinds.get(key, FeatureType.STATE), shape=shape)
+            for key, (shape, _) in shapes.items()
+        }
+        if self.colour_size is not None:
+            features[RGB_KEY] = PolicyFeature(type=FeatureType.VISUAL, shape=(*self.colour_size, 3))
+        return {ACTION_KEY: EnvAction.of(self.body, self.fps), **features}

@@ -15,7 +15,7 @@ from lerobot_vtrefine.datasets.features import DEPTH_KEY, LIMITS, columns
 from lerobot_vtrefine.embodiments import Embodiment
 from lerobot_vtrefine.envs.config import VtRefineEnvConfig
 from lerobot_vtrefine.envs.episodes import Array, Episodes
-from lerobot_vtrefine.envs.factory import make_episodes_on_device
+from lerobot_vtrefine.envs.factory import make_episodes
 from lerobot_vtrefine.sim.task import FAILURES, SIMULATION_FAILED
 
 Batch = dict[str, Tensor]
@@ -193,5 +193,5 @@ def make_decision_env(
 ) -> LeRobotDecisionEnv:
     """The decision environment of ``config`` for a policy with this observation window and chunk."""
     max_decisions = math.ceil(config.max_episode_steps / n_action_steps)
-    episodes = make_episodes_on_device(config, num_envs)
+    episodes = make_episodes(config, num_envs, on_device=True)
     return LeRobotDecisionEnv(episodes, preprocessor, postprocessor, n_obs_steps, max_decisions)

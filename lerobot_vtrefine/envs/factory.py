@@ -10,7 +10,7 @@ from lerobot_vtrefine.embodiments import menagerie_file
 from lerobot_vtrefine.envs.ablation import make_ablation
 from lerobot_vtrefine.envs.config import VtRefineEnvConfig
 from lerobot_vtrefine.envs.episode_log import EpisodeLog
-from lerobot_vtrefine.envs.episodes import Ablation, Array, Episodes
+from lerobot_vtrefine.envs.episodes import Array, Episodes
 from lerobot_vtrefine.envs.start_bank import StartBank
 
 if TYPE_CHECKING:
@@ -49,29 +49,17 @@ def make_simulation(config: VtRefineEnvConfig, num_envs: int) -> "InsertionSim":
     )
 
 
-def make_episodes(config: VtRefineEnvConfig, num_envs: int) -> Episodes:
-    """The simulation with ablation, metrics log and colour camera as configured."""
-    sim = make_simulation(config, num_envs)
-    colour = _colour_camera(config, sim)
-    return Episodes(sim, _ablation(config), _log(config), colour, start=_start(config, sim))
+def make_episodes(config: VtRefineEnvConfig, num_envs: int, on_device: bool = False) -> Episodes:
+    """The simulation with ablation, metrics log and colour camera as configured.
 
-
-def make_episodes_on_device(config: VtRefineEnvConfig, num_envs: int) -> Episodes:
-    """The same for policies that compute where the simulation does, and see no colour.
-
-    An ablation takes frames of the host all the same.
+    ``on_device``: for a policy that computes where the simulation does, and sees no colour. An ablation takes
+    frames of the host all the same.
     """
-    ablation = _ablation(config)
+    ablation = make_ablation(config.ablate, config.ablate_dataset, config.body)
     sim = make_simulation(config, num_envs)
-    return Episodes(sim, ablation, _log(config), on_device=ablation is None, start=_start(config, sim))
-
-
-def _ablation(config: VtRefineEnvConfig) -> Ablation | None:
-    return make_ablation(config.ablate, config.ablate_dataset, config.body)
-
-
-def _log(config: VtRefineEnvConfig) -> EpisodeLog | None:
-    return EpisodeLog(config.metrics_path) if config.metrics_path is not None else None
+    log = EpisodeLog(config.metrics_path) if config.metrics_path is not None else None
+    colour = None if on_device else _colour_camera(config, sim)
+    return Episodes(sim, ablation, log, colour, on_device and ablation is None, _start(config, sim))
 
 
 def _start(config: VtRefineEnvConfig, sim: "InsertionSim") -> Callable[[Array, Array], None] | None:

@@ -7,7 +7,7 @@ import numpy as np
 
 from lerobot_vtrefine.envs.config import VtRefineEnvConfig
 from lerobot_vtrefine.envs.episodes import Array
-from lerobot_vtrefine.envs.vector_env import Observation, VtRefineVectorEnv
+from lerobot_vtrefine.envs.vector_env import SEED_LIMIT, Observation, VtRefineVectorEnv
 
 
 class VtRefineEnv(gym.Env[Observation, Array]):
@@ -33,7 +33,7 @@ class VtRefineEnv(gym.Env[Observation, Array]):
     ) -> tuple[Observation, dict[str, Any]]:
         """Start the episode of ``seed``; without one, of a seed drawn from the environment's generator."""
         super().reset(seed=seed)
-        drawn = int(self.np_random.integers(2**31)) if seed is None else seed
+        drawn = int(self.np_random.integers(SEED_LIMIT)) if seed is None else seed
         observation, info = self._batch.reset(seed=[drawn])
         return _first(observation), {"is_success": False, **_shear(info)}
 

@@ -19,8 +19,7 @@ def action_space(config: VtRefineEnvConfig) -> spaces.Box:
 
 def observation_space(config: VtRefineEnvConfig) -> spaces.Dict:
     """One environment's raw observation: joints, pad counts, depth, camera, and colour where it is on."""
-    height, width = config.camera_size
-    shapes = env_observation_shapes(height, width, config.body, config.limited)
+    shapes = env_observation_shapes(*config.camera_size, config.body, config.limited)
     found: dict[str, spaces.Space] = {key: _box(shape, highest) for key, (shape, highest) in shapes.items()}
     if config.colour_size is not None:
         found["pixels"] = spaces.Dict({CAMERA: spaces.Box(0, 255, (*config.colour_size, 3), np.uint8)})
