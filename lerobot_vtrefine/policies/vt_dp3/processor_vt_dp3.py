@@ -5,7 +5,6 @@ The same pipeline, saved with the checkpoint, serves training batches (B, To, ..
 ...) and robot frames; so all of them see the same cloud.
 """
 
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
@@ -122,9 +121,8 @@ class VisuoTactileProcessorStep(ObservationProcessorStep):
         if self.modalities:
             built[CLOUD_KEY] = self._cloud(observation)
         if self.grids:
-            lead, keys = _require(observation, STATE_KEY).shape[:-1], (tactile_keys, baseline_keys)
-            tactile, baseline = (_pads(observation, of(self._body), lead) for of in keys)
-            built[GRIDS_KEY] = pad_grids(tactile, baseline, self._grid_shape, self.observation_config)
+            counts = self._counts(observation)
+            built[GRIDS_KEY] = pad_grids(*counts, self._grid_shape, self.observation_config)
         return built
 
     @property
@@ -137,19 +135,14 @@ class VisuoTactileProcessorStep(ObservationProcessorStep):
         return get_embodiment(self.observation_config.embodiment)
 
     def _cloud(self, observation: dict[str, Any]) -> Tensor:
-        state = _require(observation, STATE_KEY)
-        lead = state.shape[:-1]
         tactile = baseline = depth = intrinsics = pose = None
         if self.modalities != "visual":
-            tactile, baseline = (
-                _pads(observation, tactile_keys(self._body), lead),
-                _pads(observation, baseline_keys(self._body), lead),
-            )
+            tactile, baseline = self._counts(observation)
         if self.modalities != "tactile":
             depth = _require(observation, DEPTH_KEY)
             intrinsics, pose = _require(observation, INTRINSICS_KEY), _require(observation, CAMERA_POSE_KEY)
         return build_visuo_tactile(
-            state,
+            _require(observation, STATE_KEY),
             tactile,
             baseline,
             depth,
@@ -158,6 +151,15 @@ class VisuoTactileProcessorStep(ObservationProcessorStep):
             self.observation_config,
             noise_level=observation.get(NOISE_LEVEL_KEY),
         )
+
+    def _counts(self, observation: dict[str, Any]) -> tuple[Tensor, Tensor]:
+        """Counts of all pads and their idle counts, (..., P, taxels) each."""
+        lead = _require(observation, STATE_KEY).shape[:-1]
+        touch, idle = (
+            torch.stack([_require(observation, key).reshape(*lead, -1) for key in keys], dim=-2)
+            for keys in (tactile_keys(self._body), baseline_keys(self._body))
+        )
+        return touch, idle
 
     def get_config(self) -> dict[str, Any]:
         """Saved with the checkpoint."""
@@ -195,11 +197,6 @@ def _require(observation: dict[str, Any], key: str) -> Tensor:
             " the pads and the camera of the robot that its demonstrations are of"
         )
     return torch.as_tensor(observation[key])
-
-
-def _pads(observation: dict[str, Any], keys: tuple[str, ...], lead: Sequence[int]) -> Tensor:
-    """Counts of all pads, (*lead, P, taxels)."""
-    return torch.stack([_require(observation, key).reshape(*lead, -1) for key in keys], dim=-2)
 
 
 def make_vt_dp3_pre_post_processors(
