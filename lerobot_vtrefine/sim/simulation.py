@@ -11,10 +11,10 @@ import mujoco
 import numpy as np
 import torch
 
+from lerobot_vtrefine.cores import usable_cores
 from lerobot_vtrefine.embodiments import Embodiment
 from lerobot_vtrefine.sim import starts, task
 from lerobot_vtrefine.sim.backends import Trace, get_backend
-from lerobot_vtrefine.sim.backends.batch import usable_cores
 from lerobot_vtrefine.sim.config import (
     RANGES,
     RandomizationConfig,

@@ -1,7 +1,6 @@
 """``results.json``: what the evaluations of a pipeline measured, with intervals, seeds and seconds."""
 
 import json
-import os
 import platform
 from collections import Counter
 from collections.abc import Sequence
@@ -14,6 +13,7 @@ from lerobot_vtrefine.cli.pipeline.demo_config import DemoConfig
 from lerobot_vtrefine.cli.pipeline.stages import StageRecord
 from lerobot_vtrefine.cli.report.statistics import proportion, quantiles
 from lerobot_vtrefine.cli.results.provenance import provenance
+from lerobot_vtrefine.cores import usable_cores
 from lerobot_vtrefine.envs.episode_log import read_episode_log
 from lerobot_vtrefine.files import decode, limits, read_json
 
@@ -158,6 +158,6 @@ def machine() -> dict[str, Any]:
     return {
         "python": platform.python_version(),
         "system": f"{platform.system()} {platform.machine()}",
-        "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
+        "cores": usable_cores(),
         "packages": {name: version(name) for name in packages},
     }

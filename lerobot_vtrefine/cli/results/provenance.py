@@ -1,13 +1,14 @@
 """Which code, command and machine a run had, for the files that it leaves."""
 
 import json
-import os
 import re
 import shlex
 import subprocess
 import sys
 from functools import cache
 from pathlib import Path
+
+from lerobot_vtrefine.cores import usable_cores
 
 FILE_NAME = "provenance.json"
 PACKAGE = Path(__file__).parents[2]
@@ -41,9 +42,10 @@ def machine() -> str:
     """Cores and GPUs that this process may use, for example ``16 cores, 1 x NVIDIA H200``."""
     import torch
 
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     gpus = [torch.cuda.get_device_name(index) for index in range(torch.cuda.device_count())]
-    return ", ".join([f"{cores} cores", *(f"{gpus.count(name)} x {name}" for name in dict.fromkeys(gpus))])
+    return ", ".join(
+        [f"{usable_cores()} cores", *(f"{gpus.count(name)} x {name}" for name in dict.fromkeys(gpus))]
+    )
 
 
 def provenance() -> dict[str, str | None]:

@@ -19,6 +19,7 @@ import mujoco
 import numpy as np
 from mujoco.batch import Batch as Worlds
 
+from lerobot_vtrefine.cores import usable_cores
 from lerobot_vtrefine.diagnose.joints import gravity
 from lerobot_vtrefine.diagnose.joints.batch import Batch, frame_s
 from lerobot_vtrefine.diagnose.joints.candidates import CATALOGUE
@@ -30,7 +31,6 @@ from lerobot_vtrefine.diagnose.joints.servo import play_operator
 from lerobot_vtrefine.diagnose.joints.servo_trials import Point
 from lerobot_vtrefine.embodiments import get_embodiment
 from lerobot_vtrefine.sim import task
-from lerobot_vtrefine.sim.backends.batch import usable_cores
 from lerobot_vtrefine.sim.config import SceneConfig
 from lerobot_vtrefine.sim.scene import build_arms
 

@@ -10,12 +10,12 @@ import numpy as np
 import torch
 from mujoco.batch import Batch
 
+from lerobot_vtrefine.cores import usable_cores
 from lerobot_vtrefine.diagnose.joints.batch import padded
 from lerobot_vtrefine.diagnose.parts.episodes import AssumedScene, HandledEpisode, without_hands
 from lerobot_vtrefine.embodiments import Embodiment
 from lerobot_vtrefine.sim import task
 from lerobot_vtrefine.sim.backends.base import ramp
-from lerobot_vtrefine.sim.backends.batch import usable_cores
 from lerobot_vtrefine.sim.scene import build_arms
 from lerobot_vtrefine.sim.starts import HAND_RETREAT_M
 

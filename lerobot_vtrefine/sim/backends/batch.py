@@ -1,18 +1,13 @@
 """Worlds on a pool of CPU threads, by `mujoco.batch`."""
 
-import os
 from typing import override
 
 import mujoco
 import numpy as np
 from mujoco.batch import Batch
 
+from lerobot_vtrefine.cores import usable_cores
 from lerobot_vtrefine.sim.backends.base import BAD_STATE_WARNINGS, Array, Backend, Trace
-
-
-def usable_cores() -> int:
-    """Cores that this process may run on: fewer than the machine's where it was pinned."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 class BatchBackend(Backend):
