@@ -1,4 +1,3 @@
-#!/usr/bin/env python
 """vt_dp3 beside LeRobot's ACT and diffusion policy, trained by imitation on the same demonstrations.
 
     .venv/bin/python scripts/compare_policies.py --seeds 0 1 2 --device=cuda --jobs 12 --backend=warp
@@ -22,7 +21,7 @@ from runs.side_by_side import run_all
 from lerobot_vtrefine.cli.arguments import CommandParser
 from lerobot_vtrefine.cli.errors import run_cli
 from lerobot_vtrefine.cli.pipeline.demo_config import EVAL_SEED_OFFSET
-from lerobot_vtrefine.cli.pipeline.stages import Stage, StageRunner, trained_policy
+from lerobot_vtrefine.cli.pipeline.stages import Stage, StageRunner, evaluation_stage, trained_policy
 from lerobot_vtrefine.cli.report.results import load_evaluation
 from lerobot_vtrefine.cli.results.collect import save
 from lerobot_vtrefine.cli.results.provenance import provenance
@@ -86,8 +85,7 @@ def policy_stages(options: argparse.Namespace, policy: str, seed: int) -> list[S
         "--num_workers=0",  # items come from memory
         "--env_eval_freq=0",
     )
-    evaluate = (
-        "lerobot-eval",
+    judging = (
         f"--config_path={PREFIX}{options.task}",
         f"--policy.path={checkpoint}",
         f"--policy.device={options.device}",
@@ -95,15 +93,11 @@ def policy_stages(options: argparse.Namespace, policy: str, seed: int) -> list[S
         f"--env.rgb={str(config.endswith('_rgb')).lower()}",
         "--env.video_episodes=0",
         f"--env.metrics_path={judged / 'episodes.jsonl'}",
-        f"--eval.n_episodes={options.episodes}",
-        f"--eval.batch_size={min(options.eval_envs, options.episodes)}",
-        f"--seed={EVAL_SEED_OFFSET}",
-        f"--output_dir={judged}",
     )
-    trained, done = f"train_{name}", judged / "eval_info.json"
+    trained, counts = f"train_{name}", (options.episodes, options.eval_envs, EVAL_SEED_OFFSET)
     return [
         Stage(trained, f"Train {name}", train, out, checkpoint / "model.safetensors", ("record",)),
-        Stage(f"eval_{name}", f"Evaluate {name}", evaluate, judged, done, (trained,)),
+        evaluation_stage(f"Evaluate {name}", judging, judged, *counts, (trained,)),
     ]
 
 

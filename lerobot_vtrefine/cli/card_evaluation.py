@@ -6,7 +6,7 @@ from pathlib import Path
 from lerobot.utils.constants import CHECKPOINTS_DIR, LAST_CHECKPOINT_LINK, PRETRAINED_MODEL_DIR
 
 from lerobot_vtrefine.cli.arguments import flags
-from lerobot_vtrefine.cli.pipeline.stages import Stage, StageRunner
+from lerobot_vtrefine.cli.pipeline.stages import Stage, StageRunner, evaluation_stage
 from lerobot_vtrefine.cli.sharing import EPISODES, push_policy
 from lerobot_vtrefine.envs.config import VtRefineEnvConfig
 from lerobot_vtrefine.envs.evaluation_note import changed_settings
@@ -16,7 +16,7 @@ FIRST_SEED = 9_000_000
 """Of the evaluation of a run with seed 0; further from its training's seeds than any run has episodes."""
 
 
-def evaluation_stage(cfg: FinetunePipelineConfig, checkpoint: Path) -> Stage:
+def card_stage(cfg: FinetunePipelineConfig, checkpoint: Path) -> Stage:
     """``lerobot-eval`` of a run's checkpoint in the environment that it was tuned in, on seeds of its own.
 
     A policy that practised from a bank of states is judged from the table.
@@ -24,18 +24,16 @@ def evaluation_stage(cfg: FinetunePipelineConfig, checkpoint: Path) -> Stage:
     assert isinstance(cfg.env, VtRefineEnvConfig)
     assert cfg.policy is not None
     output = cfg.output_dir / f"evaluation_{checkpoint.name}"
-    command = (
-        "lerobot-eval",
+    judging = (
         f"--policy.path={checkpoint / PRETRAINED_MODEL_DIR}",
         f"--policy.device={cfg.policy.device}",
         *flags("env", {"type": cfg.env.type} | changed_settings(replace(cfg.env, start_bank=None))),
         f"--env.metrics_path={output / EPISODES}",
-        f"--eval.n_episodes={cfg.eval.n_episodes}",
-        f"--eval.batch_size={cfg.eval.batch_size}",
-        f"--seed={FIRST_SEED + cfg.seed}",
-        f"--output_dir={output}",
     )
-    return Stage(output.name, "Evaluate for the card", command, output, output / "eval_info.json")
+    episodes, at_once = cfg.eval.n_episodes, cfg.eval.batch_size
+    return evaluation_stage(
+        "Evaluate for the card", judging, output, episodes, at_once, FIRST_SEED + cfg.seed
+    )
 
 
 def evaluate_and_push(cfg: FinetunePipelineConfig) -> None:
@@ -46,6 +44,6 @@ def evaluate_and_push(cfg: FinetunePipelineConfig) -> None:
     """
     assert cfg.repo_id is not None
     checkpoint = (cfg.output_dir / CHECKPOINTS_DIR / LAST_CHECKPOINT_LINK).resolve()
-    stage = evaluation_stage(cfg, checkpoint)
+    stage = card_stage(cfg, checkpoint)
     StageRunner(cfg.output_dir, [stage]).run()
     push_policy(checkpoint / PRETRAINED_MODEL_DIR, cfg.repo_id, stage.output, private=cfg.private)

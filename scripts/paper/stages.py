@@ -15,7 +15,7 @@ from lerobot_vtrefine.cli.pipeline.demo_config import (
     TRAIN_SEED_OFFSET,
     default_degradation,
 )
-from lerobot_vtrefine.cli.pipeline.stages import Stage, trained_policy
+from lerobot_vtrefine.cli.pipeline.stages import Stage, evaluation_stage, trained_policy
 from lerobot_vtrefine.shipped import PREFIX
 from paper.trained import Trained, first_seed, iterations_of
 
@@ -244,24 +244,20 @@ def dppo_settings(options: argparse.Namespace) -> dict[str, Any]:
     return RECIPES[options.recipe]["dppo"] | (DPPO if on_a_gpu(options) else {}) | options.dppo
 
 
-def evaluation_stage(options: argparse.Namespace, policy: Trained, stage: str) -> Stage:
+def judging_stage(options: argparse.Namespace, policy: Trained, stage: str) -> Stage:
     """Stock lerobot-eval of ``imitation`` or ``finetune``, from the table."""
     trained = options.output_dir / f"{stage}_{policy.name}"
     out = options.output_dir / f"eval_{trained.name}"
-    command = (
-        "lerobot-eval",
+    judging = (
         *task_flags(options, policy.pair),
         f"--env.backend={options.backend}",
         f"--policy.path={trained_policy(trained)}",
         f"--policy.device={options.device}",
         "--env.video_episodes=0",
         f"--env.metrics_path={out / 'episodes.jsonl'}",
-        f"--eval.n_episodes={options.episodes}",
-        f"--eval.batch_size={min(options.eval_envs, options.episodes)}",
-        f"--seed={first_seed(policy)}",
-        f"--output_dir={out}",
     )
-    return Stage(out.name, f"Evaluate {trained.name}", command, out, out / "eval_info.json", (trained.name,))
+    counts = options.episodes, options.eval_envs, first_seed(policy)
+    return evaluation_stage(f"Evaluate {trained.name}", judging, out, *counts, (trained.name,))
 
 
 def shared_stages(options: argparse.Namespace, policy: Trained) -> list[Stage]:
@@ -274,7 +270,7 @@ def stages(options: argparse.Namespace, policy: Trained) -> list[Stage]:
     """All of one policy's. Random weights are not judged before DPPO."""
     before = [*shared_stages(options, policy), imitation_stage(options, policy)]
     if policy.demonstrations:
-        before.append(evaluation_stage(options, policy, "imitation"))
+        before.append(judging_stage(options, policy, "imitation"))
     if uses_bank(options, policy):
         before.append(bank_stage(options, policy))
-    return [*before, finetune_stage(options, policy), evaluation_stage(options, policy, "finetune")]
+    return [*before, finetune_stage(options, policy), judging_stage(options, policy, "finetune")]

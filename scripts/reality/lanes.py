@@ -2,7 +2,7 @@
 
 from lerobot_vtrefine.cli.pipeline.stages import Stage
 from reality.budget import Budget, folder_name
-from reality.stages import diagnosis_stages, evaluation_stage, finetune_stage, imitation_stages
+from reality.stages import diagnosis_stages, finetune_stage, imitation_stages, judging_stage
 
 Lanes = dict[str, list[Stage]]
 """Stages that run one after the other, by name."""
@@ -33,7 +33,7 @@ def lanes(budget: Budget) -> tuple[Lanes, Lanes]:
     for world in ("plain", *(f"diagnosed:{name}" for name in budget.realities)):
         pairs = [pair for pair in evaluations(budget) if pair[0] == world]
         for seed in budget.seeds:
-            judged = [evaluation_stage(budget, *pair, seed) for pair in pairs]
+            judged = [judging_stage(budget, *pair, seed) for pair in pairs]
             lane = folder_name("policy", world, str(seed))
             policies[lane] = [*before[folder_name(world)], finetune_stage(budget, world, seed), *judged]
     return before, policies

@@ -7,7 +7,7 @@ from pathlib import Path
 from lerobot_vtrefine.cli.arguments import flags
 from lerobot_vtrefine.cli.pipeline.demo_config import SEED_STRIDE, TRAIN_SEED_OFFSET
 from lerobot_vtrefine.cli.pipeline.demo_stages import pretrain_stage, record_stage
-from lerobot_vtrefine.cli.pipeline.stages import Stage, trained_policy
+from lerobot_vtrefine.cli.pipeline.stages import Stage, evaluation_stage, trained_policy
 from reality.budget import Budget, folder_name, recipe, world_env
 from reality.hidden import of_robot
 
@@ -148,20 +148,16 @@ def evaluation_dir(budget: Budget, trained: str, world: str, seed: int) -> Path:
     return budget.output_dir / folder_name("eval", trained, "in", world, str(seed))
 
 
-def evaluation_stage(budget: Budget, trained: str, world: str, seed: int) -> Stage:
+def judging_stage(budget: Budget, trained: str, world: str, seed: int) -> Stage:
     """A policy, named by the world that it was fine-tuned in, on this seed's episodes of a world."""
     output, tuned = evaluation_dir(budget, trained, world, seed), finetune_dir(budget, trained, seed)
-    command = (
-        "lerobot-eval",
+    judging = (
         f"--policy.path={trained_policy(tuned)}",
         f"--policy.device={budget.device}",
         *env_flags(budget, world),
         f"--env.metrics_path={output / 'episodes.jsonl'}",
         "--env.video_episodes=0",
-        f"--eval.n_episodes={budget.eval_episodes}",
-        f"--eval.batch_size={min(budget.eval_envs, budget.eval_episodes)}",
-        f"--seed={recipe(budget, seed).eval_seed}",
-        f"--output_dir={output}",
     )
+    counts = budget.eval_episodes, budget.eval_envs, recipe(budget, seed).eval_seed
     title = f"Evaluate {trained} in {world}, seed {seed}"
-    return Stage(output.name, title, command, output, output / "eval_info.json", (tuned.name,))
+    return evaluation_stage(title, judging, output, *counts, (tuned.name,))

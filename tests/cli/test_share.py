@@ -16,7 +16,7 @@ from local_hub import use_folder_as_hub
 from tiny_commands import TINY_DPPO, TINY_ENV
 
 from lerobot_vtrefine.cli import finetune, share, sharing
-from lerobot_vtrefine.cli.card_evaluation import evaluation_stage
+from lerobot_vtrefine.cli.card_evaluation import card_stage
 from lerobot_vtrefine.cli.record_demos import RecordDemosConfig
 from lerobot_vtrefine.cli.report.results import load_evaluation, percent
 from lerobot_vtrefine.embodiments import CameraConfig
@@ -216,6 +216,6 @@ def test_who_is_not_logged_in_is_told_before_anything_is_made(monkeypatch, tmp_p
 def test_a_policy_that_practised_from_a_bank_is_judged_from_the_table(tmp_path: Path) -> None:
     env = VtRefineEnvConfig(start="table", fps=20, start_bank=tmp_path / "starts.npz")
     run = FinetunePipelineConfig(env, VtDp3Config(device="cpu"), output_dir=tmp_path)
-    line = evaluation_stage(run, tmp_path / "checkpoints" / "000001").line
+    line = card_stage(run, tmp_path / "checkpoints" / "000001").line
     assert "--env.fps=20" in line
     assert "start_bank" not in line

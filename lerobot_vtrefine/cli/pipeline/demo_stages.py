@@ -1,8 +1,10 @@
 """The demo's stages: the command lines that its numbers make."""
 
+from dataclasses import replace
+
 from lerobot_vtrefine.cli.arguments import flags
 from lerobot_vtrefine.cli.pipeline.demo_config import REPO_ID, SEED_STRIDE, TRAIN_SEED_OFFSET, DemoConfig
-from lerobot_vtrefine.cli.pipeline.stages import Stage
+from lerobot_vtrefine.cli.pipeline.stages import Stage, evaluation_stage
 
 
 def record_stage(config: DemoConfig) -> Stage:
@@ -53,29 +55,28 @@ def pretrain_stage(config: DemoConfig) -> Stage:
     )
 
 
-def evaluation_stage(config: DemoConfig, policy: str, ablation: str = "none") -> Stage:
+def judging_stage(config: DemoConfig, policy: str, ablation: str = "none") -> Stage:
     """LeRobot's own evaluation on unseen seeds, optionally with one sense replaced by its mean."""
-    output = config.evaluation_dir(policy, ablation)
-    episodes = config.eval_episodes if ablation == "none" else config.ablation_episodes
-    command = [
-        "lerobot-eval",
+    output, whole = config.evaluation_dir(policy, ablation), ablation == "none"
+    judging = [
         f"--policy.path={config.checkpoint(policy)}",
         f"--policy.device={config.device}",
         *flags("env", {"type": "vtrefine"} | config.task),
         f"--env.metrics_path={output / 'episodes.jsonl'}",
-        f"--env.video_episodes={config.videos if ablation == 'none' else 0}",
-        f"--eval.n_episodes={episodes}",
-        f"--eval.batch_size={min(config.eval_envs, episodes)}",
-        f"--seed={config.eval_seed}",
-        f"--output_dir={output}",
+        f"--env.video_episodes={config.videos if whole else 0}",
     ]
     title = {"pretrain": "Evaluate imitation", "finetune": "Evaluate DPPO"}[policy]
-    needs = [policy]
-    if ablation != "none":
-        command += [f"--env.ablate={ablation}", f"--env.ablate_dataset={config.dataset_dir}"]
-        title += f" without {ablation}"
-        needs.append("record")
-    return Stage(output.name, title, tuple(command), output, output / "eval_info.json", tuple(needs))
+    episodes = config.eval_episodes if whole else config.ablation_episodes
+    stage = evaluation_stage(title, judging, output, episodes, config.eval_envs, config.eval_seed, (policy,))
+    if whole:
+        return stage
+    ablated = (f"--env.ablate={ablation}", f"--env.ablate_dataset={config.dataset_dir}")
+    return replace(
+        stage,
+        title=f"{title} without {ablation}",
+        command=stage.command + ablated,
+        needs=(policy, "record"),
+    )
 
 
 def finetune_stage(config: DemoConfig) -> Stage:
@@ -109,8 +110,8 @@ def demo_stages(config: DemoConfig) -> list[Stage]:
     return [
         record_stage(config),
         pretrain_stage(config),
-        evaluation_stage(config, "pretrain"),
+        judging_stage(config, "pretrain"),
         finetune_stage(config),
-        evaluation_stage(config, "finetune"),
-        *(evaluation_stage(config, policy, modality) for policy, modality in config.ablations()),
+        judging_stage(config, "finetune"),
+        *(judging_stage(config, policy, modality) for policy, modality in config.ablations()),
     ]

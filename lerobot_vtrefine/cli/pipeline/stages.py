@@ -81,6 +81,27 @@ def trained_policy(folder: Path) -> Path:
     return folder / "checkpoints" / "last" / "pretrained_model"
 
 
+def evaluation_stage(
+    title: str,
+    flags: Sequence[str],
+    output: Path,
+    episodes: int,
+    at_once: int,
+    seed: int,
+    needs: tuple[str, ...] = (),
+) -> Stage:
+    """Stock lerobot-eval, whose ``flags`` name policy and environment, on ``episodes`` from ``seed`` on."""
+    command = (
+        "lerobot-eval",
+        *flags,
+        f"--eval.n_episodes={episodes}",
+        f"--eval.batch_size={min(at_once, episodes)}",
+        f"--seed={seed}",
+        f"--output_dir={output}",
+    )
+    return Stage(output.name, title, command, output, output / "eval_info.json", needs)
+
+
 def stage_keys(stages: list[Stage]) -> dict[str, str]:
     """Fingerprint of each stage: its command and the fingerprints of the stages it needs."""
     keys: dict[str, str] = {}
