@@ -33,7 +33,7 @@ def measure(args: argparse.Namespace, kind: str) -> dict[str, Any]:
 
 
 @run_cli
-def main() -> int:
+def main() -> None:
     """Prints a JSON object a line."""
     parser = CommandParser(description=__doc__)
     parser.add_argument("--policy", type=Path, required=True, help="a fine-tuned vt_dp3's folder")
@@ -48,7 +48,6 @@ def main() -> int:
         raise ValueError(f"--kinds {' '.join(wanting)} needs --dataset=FOLDER, whose touch is put in place")
     for kind in args.kinds:
         print(json.dumps(measure(args, kind)), flush=True)
-    return 0
 
 
 if __name__ == "__main__":

@@ -1,4 +1,3 @@
-#!/usr/bin/env python
 """How good is vtrefine-diagnose on the third rig? 12 x 32 taxels, 16 presses, jittered clocks.
 
 The recordings come from tests/diagnose/jittered_rig.py: laws in several forms, scaled to an achievable gain.
@@ -107,4 +106,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    raise SystemExit(main())

@@ -1,4 +1,3 @@
-#!/usr/bin/env python
 """How good is vtrefine-diagnose on recordings by an author who has not seen it?
 
 The recordings come from tests/diagnose/outsider: presses of a pad, written from the file formats and the
@@ -155,4 +154,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    raise SystemExit(main())

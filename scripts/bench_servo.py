@@ -1,4 +1,3 @@
-#!/usr/bin/env python
 """How well are runs at a gain predicted that was never fitted? Prints the table of results/servo.json.
 
 Every setting (gain, supply, load) of a recording set of a servo is left out in turn. The other recordings go
@@ -14,7 +13,6 @@ where it stopped:
 
 import json
 import os
-import sys
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -149,4 +147,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    raise SystemExit(main())

@@ -1,4 +1,3 @@
-#!/usr/bin/env python
 """Behaviour cloning of a vt_dp3 whose encoder is frozen, on features that are computed once.
 
     python scripts/clone_on_features.py --dataset=outputs/demos_cross --steps=6000 --seed=31 --device=cuda \\
@@ -114,7 +113,7 @@ def make_parser() -> CommandParser:
 
 
 @run_cli
-def main() -> int:
+def main() -> None:
     """Writes the policy with its processors."""
     args = make_parser().parse_args()
     check_device(args.device)
@@ -125,7 +124,6 @@ def main() -> int:
     for part in (policy, *processors):
         part.save_pretrained(folder)
     print(f"last loss {loss:.4f}; policy: {folder}")
-    return 0
 
 
 if __name__ == "__main__":

@@ -1,4 +1,3 @@
-#!/usr/bin/env python
 """Turn what runs left into rows of results/*.json, from which ``make tables`` makes the README's tables.
 
 One command replaces a table: --replace drops the earlier rows, of all seeds, of the tasks, policies and
@@ -19,7 +18,6 @@ Commit, command and machine are those that the run recorded; --commit, --command
 runs that could not (on a machine without git, say). What nobody says is null.
 """
 
-import sys
 from pathlib import Path
 
 from reality.outcome import reality_rows
@@ -68,4 +66,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    raise SystemExit(main())

@@ -1,4 +1,3 @@
-#!/usr/bin/env python
 """The paper's tables in simulation: AutoMate pairs from the table, with vision and with touch, by DPPO.
 
     python scripts/compare_paper.py --mesh_dir=MESHES --seeds 0 1 2 --jobs 12

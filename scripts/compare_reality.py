@@ -1,4 +1,3 @@
-#!/usr/bin/env python
 """Does diagnosis pay where it matters, in the policy? Train in the plain and in the diagnosed simulator.
 
     .venv/bin/python scripts/compare_reality.py --seeds 0 1 2

@@ -59,7 +59,7 @@ def row_of(variant: str, practice: Practice, curve: list[dict[str, float]], args
     )
 
 
-def train(args: argparse.Namespace) -> int:
+def train(args: argparse.Namespace) -> None:
     """The reference, then ours."""
     found: list[tuple[Row, list[dict[str, float]]]] = []
     if not args.skip_reference:
@@ -70,10 +70,9 @@ def train(args: argparse.Namespace) -> int:
         found.append((row_of(f"--dppo.type={name}", practice, curve, args), curve))
     save(args.results, found, replace=False)
     print(json.dumps([dataclasses.asdict(row) for row, _ in found], indent=2))
-    return 0
 
 
-def losses(args: argparse.Namespace) -> int:
+def losses(args: argparse.Namespace) -> None:
     """Prints, per sampler and term, the largest difference and the largest value."""
     reference = Reference(args.reference)
     samplers = {
@@ -91,11 +90,10 @@ def losses(args: argparse.Namespace) -> int:
     for name, (cfg, changes) in samplers.items():
         terms = compare(args, reference, cfg, changes)
         print(json.dumps({"sampler": name, "terms": terms}, indent=2), flush=True)
-    return 0
 
 
 @run_cli
-def main() -> int:
+def main() -> None:
     """``losses`` or ``train``."""
     parser = CommandParser(description=__doc__)
     parser.add_argument("what", choices=("losses", "train"))
@@ -126,7 +124,7 @@ def main() -> int:
     saved = read_json_or_none(args.policy / "config.json") or {}
     if saved.get("type") != "vt_dp3" or saved["ft_denoising_steps"]:
         raise ValueError(f"--policy={args.policy} is not a vt_dp3 from imitation, before DPPO")
-    return losses(args) if args.what == "losses" else train(args)
+    {"losses": losses, "train": train}[args.what](args)
 
 
 if __name__ == "__main__":

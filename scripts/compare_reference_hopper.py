@@ -76,7 +76,7 @@ def rows(args: argparse.Namespace) -> None:
 
 
 @run_cli
-def main() -> int:
+def main() -> None:
     """``data``, ``pretrain``, ``train`` or ``rows``."""
     parser = CommandParser(description=__doc__)
     parser.add_argument("what", choices=("data", "pretrain", "train", "rows"))
@@ -117,7 +117,6 @@ def main() -> int:
         print(json.dumps(found))
     else:
         {"pretrain": pretrain, "train": train, "rows": rows}[args.what](args)
-    return 0
 
 
 if __name__ == "__main__":

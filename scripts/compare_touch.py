@@ -1,4 +1,3 @@
-#!/usr/bin/env python
 """Does touch pay? Train visuo-tactile and visual-only policies the same way on several seeds and compare.
 
     .venv/bin/python scripts/compare_touch.py --seeds 0 1 2 --settings demo tight occluded slip short_chunk
@@ -15,18 +14,17 @@ it continues. The comparison is printed and saved as ``comparison.json`` and ``c
 """
 
 import json
-import shutil
-import sys
 from pathlib import Path
 from typing import Any
 
-import yaml
 from runs.comparison import difference, effect, interval_text, over_seeds, rate_text, save
 from runs.side_by_side import run_all
 
 from lerobot_vtrefine.cli.arguments import CommandParser
 from lerobot_vtrefine.cli.errors import run_cli
 from lerobot_vtrefine.cli.pipeline.demo_config import default_env
+from lerobot_vtrefine.cli.pipeline.stages import find_command
+from lerobot_vtrefine.files import read_yaml
 from lerobot_vtrefine.shipped import PREFIX, encoders
 
 MODALITIES = ("visuo_tactile", "visual")
@@ -95,7 +93,7 @@ TASK_FILES = Path(__file__).parents[1] / "configs" / "env"
 
 def touch_setting(task: str) -> dict[str, dict[str, Any]]:
     """A touch task or a twin for MANY_WORLDS, with the encoder of the task."""
-    env = yaml.safe_load((TASK_FILES / f"{task}.yaml").read_text(encoding="utf-8"))["env"]
+    env = read_yaml(TASK_FILES / f"{task}.yaml")["env"]
     name = task.removesuffix("_twin")
     encoder = f"{PREFIX}{name}" if name in encoders() else f"outputs/information_{name}"
     return {"env": env, "policy": {"pretrained_encoder": encoder}}
@@ -122,9 +120,8 @@ def _value(default: Any, changes: dict[str, Any]) -> str:
 def demo_command(folder: Path, run: Run, extra: list[str]) -> list[str]:
     """The command line of one pipeline."""
     setting, modality, seed = run
-    command = shutil.which("vtrefine-demo", path=str(Path(sys.executable).parent)) or "vtrefine-demo"
     own = [f"--modalities={modality}", f"--seed={seed}", f"--output_dir={folder}"]
-    return [command, *own, *setting_flags(setting), *extra]
+    return [find_command("vtrefine-demo"), *own, *setting_flags(setting), *extra]
 
 
 def compare(results: dict[str, dict[int, dict]]) -> dict:

@@ -142,7 +142,7 @@ def measure(args: argparse.Namespace) -> dict[str, Any]:
 
 
 @run_cli
-def main() -> int:
+def main() -> None:
     """Prints a JSON object."""
     parser = CommandParser(description=__doc__)
     parser.add_argument("--policy", type=Path, required=True, help="an imitation-learned vt_dp3's folder")
@@ -154,7 +154,6 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=0, help="of the first episode")
     parser.add_argument("--deployed", action="store_true", help="judge the deployed policy too")
     print(json.dumps(measure(parser.parse_args()), indent=2))
-    return 0
 
 
 if __name__ == "__main__":

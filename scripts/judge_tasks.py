@@ -1,4 +1,3 @@
-#!/usr/bin/env python
 """Which tasks need touch? ``vtrefine-information`` on each, its verdict as a row of results/touch_tasks.json.
 
     python scripts/judge_tasks.py key_turned key_turned_twin --effort.device=cuda --env.backend=warp
@@ -97,4 +96,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    raise SystemExit(main())

@@ -1,4 +1,3 @@
-#!/usr/bin/env python
 """Draw the pictures of the documentation from the simulator and from results/: docs/img/.
 
 MUJOCO_GL=egl python scripts/make_figures.py            # all, about two minutes
@@ -297,4 +296,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    raise SystemExit(main())

@@ -1,10 +1,8 @@
-#!/usr/bin/env python
 """Write every table of results/*.json into the blocks ``<!-- table: NAME -->`` of README.md and docs/.
 
 python scripts/make_tables.py
 """
 
-import sys
 from pathlib import Path
 
 from lerobot_vtrefine.cli.arguments import CommandParser
@@ -34,4 +32,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    raise SystemExit(main())

@@ -1,4 +1,3 @@
-#!/usr/bin/env python
 """Measure how often the scripted expert inserts, for every body, pair, clearance and start.
 
     python scripts/measure_expert.py --episodes=50
@@ -11,7 +10,6 @@ have a clearance of their own. Episode i has seed i.
 """
 
 import itertools
-import sys
 from collections import Counter
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -142,4 +140,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    raise SystemExit(main())

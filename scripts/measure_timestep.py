@@ -1,4 +1,3 @@
-#!/usr/bin/env python
 """What a longer physics step changes: rows of results/timestep.json, one a step.
 
     python scripts/measure_timestep.py --timesteps_s='[0.001, 0.0025, 0.005]' --episodes=256
@@ -7,7 +6,6 @@
 A trained policy plays the same held-out episodes of a task in every step. Minutes on a CPU.
 """
 
-import sys
 import time
 from pathlib import Path
 
@@ -76,4 +74,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    raise SystemExit(main())

@@ -1,4 +1,3 @@
-#!/usr/bin/env python
 """How precisely must one know where things are? Rows of results/tolerance.json, task by task.
 
     python scripts/measure_tolerance.py round_grasped square_grasped_1mm cross_gentle --episodes=256
@@ -9,13 +8,10 @@ lerobot_vtrefine/information/tolerance.py says. No sensors, no training: minutes
 vtrefine-information draws the same as curves, and on them what the senses know.
 """
 
-import sys
 from dataclasses import replace
 from pathlib import Path
 
-import draccus
 import numpy as np
-from lerobot.envs import EnvConfig
 from tqdm import tqdm
 
 from lerobot_vtrefine.cli.arguments import CommandParser
@@ -24,8 +20,7 @@ from lerobot_vtrefine.cli.results.cells import share
 from lerobot_vtrefine.cli.results.collect import save
 from lerobot_vtrefine.cli.results.provenance import provenance
 from lerobot_vtrefine.cli.results.rows import Line
-from lerobot_vtrefine.files import read_yaml
-from lerobot_vtrefine.finetune.pipeline import checked_env
+from lerobot_vtrefine.finetune.pipeline import env_of
 from lerobot_vtrefine.information.tolerance import LATERAL, SIZES, Tolerated, tolerance
 from lerobot_vtrefine.shipped import find
 
@@ -54,7 +49,7 @@ def main() -> None:
     parser.add_argument("--results", type=Path, default=RESULTS / f"{TABLE}.json", help="file of the rows")
     options = parser.parse_args()
     for task in options.tasks:
-        env = checked_env(draccus.decode(EnvConfig, read_yaml(find("--config_path", task))["env"]))
+        env = env_of(find("--config_path", task))
         config = replace(env, backend=options.backend, mesh_dir=options.mesh_dir or env.mesh_dir)
         with tqdm(total=sum(map(len, SIZES.values())), desc=task) as bar:
             found = tolerance(config, options.episodes, options.num_envs, bar.update)
@@ -62,4 +57,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    raise SystemExit(main())

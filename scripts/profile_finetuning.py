@@ -142,7 +142,7 @@ def profile(args: argparse.Namespace, worlds: int) -> dict[str, Any]:
 
 
 @run_cli
-def main() -> int:
+def main() -> None:
     """Prints a JSON object per number of worlds."""
     parser = CommandParser(description=__doc__)
     parser.add_argument("--device", default="cpu", help="of simulation and policy: cpu or cuda")
@@ -161,7 +161,6 @@ def main() -> int:
         print(json.dumps(rows[-1], indent=2), flush=True)
     if args.json is not None:
         args.json.write_text(json.dumps(rows, indent=2) + "\n", encoding="utf-8")
-    return 0
 
 
 if __name__ == "__main__":

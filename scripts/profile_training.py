@@ -72,7 +72,7 @@ def train(name: str, root: Path, args: argparse.Namespace) -> dict[str, Any]:
 
 
 @run_cli
-def main() -> int:
+def main() -> None:
     """Prints a JSON object per policy."""
     parser = CommandParser(description=__doc__)
     parser.add_argument("--device", default="cpu", help="cpu or cuda")
@@ -93,7 +93,6 @@ def main() -> int:
             print(json.dumps(rows[-1]), flush=True)
     if args.json is not None:
         args.json.write_text(json.dumps(rows, indent=2) + "\n", encoding="utf-8")
-    return 0
 
 
 if __name__ == "__main__":

@@ -1,4 +1,3 @@
-#!/usr/bin/env python
 """Is the wheel fit to be released? Build and check it, and do what the README says in an empty place.
 
     python scripts/release_check.py [--dist_only]

@@ -124,7 +124,7 @@ def measure(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
 
 
 @run_cli
-def main() -> int:
+def main() -> None:
     """Prints a JSON object a line."""
     parser = CommandParser(description=__doc__)
     parser.add_argument("--policy", type=Path, required=True, help="an imitation-learned vt_dp3's folder")
@@ -146,7 +146,6 @@ def main() -> int:
         print(json.dumps(row), flush=True)
         if args.results:
             save(args.results, [(line(args.task.stem, row), [])], replace=False)
-    return 0
 
 
 if __name__ == "__main__":

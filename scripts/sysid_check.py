@@ -1,4 +1,3 @@
-#!/usr/bin/env python
 """The same servos identified twice: by ``vtrefine-diagnose``'s baseline, and by MuJoCo's own toolbox.
 
     pip install 'mujoco[sysid]'
