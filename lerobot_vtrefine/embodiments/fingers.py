@@ -39,6 +39,9 @@ class Pad:
     layout: PadLayout = field(default_factory=PadLayout)
     """Rows, columns and pitch of the taxels, which lie centred on the face."""
 
+    def __post_init__(self) -> None:
+        self.layout.check_fits(*self.size_m[:2])
+
 
 class Faces(NamedTuple):
     """Pads' faces in the plane of the fingers, and how they move with the joint that drives each."""
@@ -78,11 +81,6 @@ class Fingers(ABC):
     """Fingers that the hand has; those of `SIDES`, in their order."""
     slide: ClassVar[bool] = False
     """Whether the joints are lengths [m]; else they are angles [rad]."""
-
-    @property
-    def pad_size_m(self) -> tuple[float, float, float]:
-        """Pad's extent along the finger, across it, and its thickness."""
-        return self.pad.size_m
 
     def pad_names(self, arm: str) -> tuple[str, ...]:
         """(S,) names of one arm's pads."""

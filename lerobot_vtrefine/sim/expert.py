@@ -375,7 +375,7 @@ def _above_table(fingers: Fingers, pitch_rad: float, height_m: float) -> tuple[f
 
     Where even the flattest hand is too low, the second number says how much higher it must grip [m].
     """
-    length, width, _ = fingers.pad_size_m
+    length, width, _ = fingers.pad.size_m
     pitches = np.linspace(pitch_rad, min(pitch_rad, fingers.flattest_rad), 50)
     gaps = height_m - (length * np.sin(pitches) + width * np.cos(pitches)) / 2 - TABLE_GAP_M
     chosen = int(np.argmax(gaps >= 0)) if gaps[-1] >= 0 else -1

@@ -79,7 +79,7 @@ def _add_sliding_finger(
         damping=[fingers.damping, 0, 0],
         armature=fingers.armature,
     )
-    length, width, thickness = fingers.pad_size_m
+    length, width, thickness = fingers.pad.size_m
     face = inward * fingers.face_m
     centre = [fingers.pad_offset_m, face - inward * thickness / 2, 0]
     _add_pad(body, fingers, arm, index, side, centre, config)
@@ -120,7 +120,7 @@ def _add_swinging_finger(
     _set_mass(finger, fingers.finger_kg, middle, fingers.finger_inertia, config)
     hinge = f"{arm}_{side}_hinge"
     _add_hinge(finger, hinge, -sign, (-1.2, 1.2), fingers)
-    length, width, thickness = fingers.pad_size_m
+    length, width, thickness = fingers.pad.size_m
     behind = sign * (pad_out + thickness / 2)
     _add_pad(finger, fingers, arm, index, side, [pad_ahead, behind, 0], config)
     back = sign * (pad_out + thickness + PLATE_M)
@@ -168,7 +168,7 @@ def _add_pad(
     centre: list[float],
     config: SceneConfig,
 ) -> None:
-    length, width, thickness = fingers.pad_size_m
+    length, width, thickness = fingers.pad.size_m
     half = [length / 2, thickness / 2, width / 2]
     name = fingers.pad.name.format(arm=arm, side=side)
     pad = add_solid(body, index, name, half, centre, PAD)

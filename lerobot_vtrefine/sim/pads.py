@@ -16,11 +16,9 @@ from lerobot_vtrefine.sim.scene import Scene
 from lerobot_vtrefine.sim.touch import Touch
 from lerobot_vtrefine.tactile import (
     BodyGeometry,
-    PadLayout,
     PadSensors,
     Poses,
     SensorModel,
-    layout_from_mesh,
 )
 from lerobot_vtrefine.tactile.shear import Shear, ShearSensors
 
@@ -36,13 +34,13 @@ class Pads:
         model: SensorModel,
         num_envs: int,
         control_dt_s: float,
-        device: str = "cpu",
-        num_threads: int = 1,
-        shear: ShearConfig | None = None,
+        device: str,
+        num_threads: int,
+        shear: ShearConfig | None,
     ) -> None:
         self._dt_s = control_dt_s
         bodies = [_touch_geometry(scene.pair.plug), _touch_geometry(scene.pair.socket)]
-        self.layout = pad_layout(scene.embodiment)
+        self.layout = scene.embodiment.pad_layout
         pads = len(scene.embodiment.pad_names)
         self.sensors = PadSensors(
             self.layout, bodies, num_envs, pads, model=model, device=device, num_threads=num_threads
@@ -118,18 +116,6 @@ def held_bodies(embodiment: Embodiment) -> tuple[int, ...]:
     """What each pad holds, of (plug, socket): (P,) indices."""
     return tuple(
         ("plug", "socket").index(arm.holds) for arm in embodiment.arms for _ in embodiment.fingers.sides
-    )
-
-
-def pad_layout(embodiment: Embodiment) -> PadLayout:
-    """The taxels, found on the pad's own surface as in the paper's appendix."""
-    length, width, thickness = embodiment.fingers.pad_size_m
-    signs = np.array([(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
-    vertices = signs * np.array([length, width, thickness]) / 2
-    faces = [(0, 1, 3), (0, 3, 2), (4, 6, 7), (4, 7, 5), (0, 4, 5), (0, 5, 1)]
-    faces += [(2, 3, 7), (2, 7, 6), (0, 2, 6), (0, 6, 4), (1, 5, 7), (1, 7, 3)]
-    return layout_from_mesh(
-        vertices, np.array(faces), embodiment.pad_layout, outward=np.array([0.0, 0.0, 1.0])
     )
 
 

@@ -164,7 +164,7 @@ def build_scene(config: SceneConfig) -> Scene:
 
 def _warn_of_close_hands(pair: PartPair, embodiment: Embodiment) -> None:
     """Warn of pairs whose hands would be in each other's way once the plug is seated."""
-    width_m = embodiment.fingers.pad_size_m[1]
+    width_m = embodiment.fingers.pad.size_m[1]
     apart_m = pair.seated_z_m + pair.plug.grip.centre_m[2] - pair.socket.grip.centre_m[2]
     if apart_m < width_m:
         logger.warning(

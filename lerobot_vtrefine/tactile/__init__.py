@@ -8,7 +8,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from lerobot_vtrefine.tactile.geometry import BodyGeometry, Box, ConvexHull, Cylinder, Sphere, TriangleMesh
-from lerobot_vtrefine.tactile.layout import PadLayout, layout_from_mesh
+from lerobot_vtrefine.tactile.layout import PadLayout
 
 if TYPE_CHECKING:
     from lerobot_vtrefine.tactile.model import SensorModel
@@ -28,7 +28,6 @@ __all__ = [
     "SensorModel",
     "Sphere",
     "TriangleMesh",
-    "layout_from_mesh",
 ]
 
 

@@ -18,7 +18,6 @@ from lerobot_vtrefine.envs.live_world import LiveWorld
 from lerobot_vtrefine.extras import VIEW, require
 from lerobot_vtrefine.observation import VisuoTactileConfig, build_visuo_tactile
 from lerobot_vtrefine.sim.menagerie_meshes import DrawnWorld
-from lerobot_vtrefine.sim.pads import pad_layout
 from lerobot_vtrefine.tactile.picture import FULL_SCALE, colours
 from lerobot_vtrefine.wording import plural
 
@@ -72,7 +71,7 @@ class BrowserView:
         model = copy.deepcopy(self._drawn.model)
         self._scene = mjviser.ViserMujocoScene(self._server, model, num_envs=1)
         self._scene.camera_tracking_enabled = False
-        layout = pad_layout(world.sim.embodiment)
+        layout = world.sim.embodiment.pad_layout
         self._pad_shape = (layout.rows, layout.cols)
         self._noise = torch.Generator().manual_seed(0)
         self._drawn_s = -np.inf

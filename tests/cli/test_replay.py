@@ -270,7 +270,7 @@ def test_hands_that_hold_nothing_in_the_twin_are_counted() -> None:
 def test_lowest_edges_are_pad_corners() -> None:
     joints = ROBOT.home + np.random.default_rng(0).normal(0, 0.2, (5, 16))
     position, rotation = (item.numpy() for item in ROBOT.pad_poses(torch.as_tensor(joints)))
-    length, width, _ = ROBOT.fingers.pad_size_m
+    length, width, _ = ROBOT.fingers.pad.size_m
     corners = np.array([[x * length / 2, y * width / 2, 0] for x in (-1, 1) for y in (-1, 1)])
     heights = (position[..., None, :] + corners @ np.swapaxes(rotation, -1, -2))[..., 2]
     assert lowest_edges(ROBOT, joints) == pytest.approx(heights.reshape(5, 2, 8).min(-1))

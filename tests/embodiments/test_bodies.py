@@ -109,7 +109,7 @@ def test_every_body_stands_in_its_scene_as_its_kinematics_say() -> None:
         mujoco.mj_kinematics(scene.model, data)
         position, rotation = KINOVA.pad_poses(torch.from_numpy(q))
         for index, name in enumerate(KINOVA.pad_names):
-            face = position[index].numpy() - rotation[index, :, 2].numpy() * KINOVA.fingers.pad_size_m[2] / 2
+            face = position[index].numpy() - rotation[index, :, 2].numpy() * KINOVA.fingers.pad.size_m[2] / 2
             np.testing.assert_allclose(data.geom(name).xpos, face, atol=1e-9)
         rates, step = torch.from_numpy(rng.normal(size=KINOVA.num_joints)), 1e-6
         after, before = (KINOVA.pad_poses(torch.from_numpy(q) + sign * step * rates) for sign in (1, -1))
@@ -184,3 +184,10 @@ def test_a_policy_says_whose_data_it_was_given() -> None:
         config.validate_features()
     config.observation = replace(config.observation, embodiment="kinova")
     config.validate_features()
+
+
+def test_a_pad_without_room_for_its_taxels_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"need 64\.0 x 24\.0 mm"):
+        replace(ALOHA.fingers.pad, size_m=(0.06, 0.026, 0.003))
+    with pytest.raises(ValueError, match=r"need 64\.0 x 24\.0 mm"):
+        replace(ALOHA.fingers.pad, size_m=(0.065, 0.0235, 0.003))

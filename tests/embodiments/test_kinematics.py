@@ -45,7 +45,7 @@ def test_unknown_embodiment_lists_choices():
 
 def test_pads_and_hands_lie_where_mujoco_puts_them(scene):
     data = mujoco.MjData(scene.model)
-    thickness = ALOHA.fingers.pad_size_m[2]
+    thickness = ALOHA.fingers.pad.size_m[2]
     for q in joint_samples(20):
         data.qpos[scene.addresses.qpos] = q
         mujoco.mj_kinematics(scene.model, data)

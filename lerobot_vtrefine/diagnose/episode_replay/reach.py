@@ -46,7 +46,7 @@ class HandReach:
 def lowest_edges(embodiment: Embodiment, joints: Array) -> Array:
     """Height in the world of each hand's lowest pad edge: (T, J) -> (T, A) [m]."""
     position, rotation = embodiment.pad_poses(torch.as_tensor(joints, dtype=torch.float64))
-    length, width, _ = embodiment.fingers.pad_size_m
+    length, width, _ = embodiment.fingers.pad.size_m
     along, across = rotation[..., 2, 0].abs(), rotation[..., 2, 1].abs()
     lowest = position[..., 2] - (length * along + width * across) / 2
     return lowest.unflatten(-1, (embodiment.num_arms, -1)).amin(-1).numpy()
