@@ -70,8 +70,7 @@ def group_gradients(
             parameter.grad = None
         ids = (rollout.env * GROUPS // worlds == group).nonzero().squeeze(1)
         for part in ids.split(1024):
-            obs = select(rollout.obs, part)
-            cond = obs["cond"] if agent.frozen_encoder else agent.actor.encode(obs)
+            cond = agent.kept_condition(agent.actor, select(rollout.obs, part))
             log_probs, _, _ = chain_log_probs(agent, rollout.latents[part], cond, cfg)
             loss = dppo.policy_loss(log_probs - rollout.log_probs[part], advantages[part], cfg)
             (loss.sum() / len(ids)).backward()
@@ -91,8 +90,7 @@ def moved_gradients(
     for centred in (True, False):
         total = [torch.zeros_like(parameter) for parameter in parameters]
         for part in torch.arange(len(advantages)).split(1024):
-            obs = select(rollout.obs, part)
-            cond = obs["cond"] if agent.frozen_encoder else agent.actor.encode(obs)
+            cond = agent.kept_condition(agent.actor, select(rollout.obs, part))
             log_probs, mean, std = chain_log_probs(agent, rollout.latents[part], cond, cfg)
             log_ratio = log_probs - rollout.log_probs[part]
             if centred:

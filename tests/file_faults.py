@@ -24,17 +24,18 @@ MODULES = (
 )
 
 
-def _count(patch: pytest.MonkeyPatch, at: int) -> list[int]:
-    """Count file operations from now on; before operation ``at`` the process ends, as by SIGKILL.
+def _kill_before(patch: pytest.MonkeyPatch, at: int) -> None:
+    """From now on, before file operation ``at`` the process ends, as by SIGKILL.
 
     Opening a file for writing counts twice: before it, and when the file is empty and nothing written yet.
     """
-    done = [0]
+    done = 0
 
     def step() -> None:
-        if done[0] == at:
+        nonlocal done
+        if done == at:
             os._exit(KILLED)
-        done[0] += 1
+        done += 1
 
     def counted(original: Callable[..., Any]) -> Callable[..., Any]:
         def call(*args: Any, **kwargs: Any) -> Any:
@@ -60,7 +61,6 @@ def _count(patch: pytest.MonkeyPatch, at: int) -> list[int]:
     wrapped = opening(io.open)
     patch.setattr(io, "open", wrapped)
     patch.setattr(builtins, "open", wrapped)
-    return done
 
 
 def in_fork(work: Callable[[], object]) -> int:
@@ -82,14 +82,6 @@ def in_fork(work: Callable[[], object]) -> int:
     return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
 
 
-def count_operations(work: Callable[[], object]) -> int:
-    """File operations of ``work``."""
-    with pytest.MonkeyPatch.context() as patch:
-        done = _count(patch, -1)
-        work()
-        return done[0]
-
-
 def killed_at_each(
     prepare: Callable[[], object], work: Callable[[], object], stride: int = 1
 ) -> Iterator[int]:
@@ -100,7 +92,7 @@ def killed_at_each(
 
         def doomed(at: int = at) -> None:
             with pytest.MonkeyPatch.context() as patch:
-                _count(patch, at)
+                _kill_before(patch, at)
                 work()
 
         status = in_fork(doomed)

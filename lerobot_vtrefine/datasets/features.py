@@ -81,6 +81,11 @@ VISUAL_KEYS = (DEPTH_KEY, INTRINSICS_KEY, CAMERA_POSE_KEY)
 TAXEL_UNIT = "adc_counts"
 
 
+def joint_keys(body: Embodiment) -> list[str]:
+    """A robot's names of its joints' positions and of their targets, in the order of the state."""
+    return [f"{name}{JOINT_SUFFIX}" for name in body.joint_names]
+
+
 def tactile_keys(body: Embodiment) -> tuple[str, ...]:
     """Columns of the pads' counts, in the order of the body's pads."""
     return tuple(f"{TACTILE_PREFIX}{pad}" for pad in body.pad_names)
@@ -160,7 +165,7 @@ def dataset_features(
         features[column.key] = {"dtype": column.dtype, "shape": column.shape}
         if column.source in (TACTILE, BASELINE):
             features[column.key]["info"] = taxel_info(layout.rows, layout.cols)
-    names = {"names": [f"{name}{JOINT_SUFFIX}" for name in body.joint_names]}
+    names = {"names": joint_keys(body)}
     features[STATE_KEY] |= names
     features[DEPTH_KEY] = {
         "dtype": "image",

@@ -269,7 +269,7 @@ class _Table:
         header_path: Path,
         index: int,
         entry: Entry,
-        without: tuple[str, ...] = (),
+        without: tuple[str, ...],
     ) -> None:
         self.folder, self.entry, self.index = folder, entry, index
         try:

@@ -85,7 +85,7 @@ class PadEmulator(EmulatedPort):
         shape: FrameShape,
         link: Path,
         *,
-        rate_hz: float = 100.0,
+        rate_hz: float,
         protocol: str = "binary",
         faults: Faults | None = None,
         seed: int = 0,

@@ -61,8 +61,7 @@ class Regulariser:
             return cls()
         means, chains = [], []
         for ids in torch.arange(len(latents)).split(cfg.minibatch_decisions):
-            seen = select(obs, ids)
-            cond = seen["cond"] if agent.frozen_encoder else agent.base.encode(seen)
+            cond = agent.kept_condition(agent.base, select(obs, ids))
             if cfg.kl_coef:
                 means.append(_reverse_steps(agent, agent.base, latents[ids], cond, cfg.eta)[0])
             if cfg.bc_coef:

@@ -252,8 +252,7 @@ class Minibatches:
         """Add the actor's gradients of decisions ``ids``; their share (5,) of the metrics after the first."""
         rollout, agent, cfg = self.rollout, self.agent, self.cfg
         rows = size * cfg.ft_denoising_steps
-        obs = select(rollout.obs, ids)
-        cond = obs["cond"] if agent.frozen_encoder else agent.actor.encode(obs)
+        cond = agent.kept_condition(agent.actor, select(rollout.obs, ids))
         log_probs, mean, std = chain_log_probs(agent, rollout.latents[ids], cond, cfg)
         log_ratio = log_probs - rollout.log_probs[ids]
         surrogate = policy_loss(log_ratio, self.advantages[ids], cfg).sum() / rows

@@ -69,6 +69,10 @@ class Agent:
         cond = self.actor.encode(obs)
         return cond, (cond if self.frozen_encoder else self.base.encode(obs))
 
+    def kept_condition(self, network: Actor, obs: Observation) -> Tensor:
+        """Condition (B, C) of what a rollout keeps: observations, or with a frozen encoder conditions."""
+        return obs["cond"] if self.frozen_encoder else network.encode(obs)
+
 
 class DecisionEnv(Protocol):
     """Environments that take one action chunk per decision and pause once finished, until the next reset.

@@ -132,7 +132,7 @@ def visual_cloud(
     camera_pose: Tensor,
     noise_level: Tensor,
     cfg: VisuoTactileConfig,
-    generator: torch.Generator | None = None,
+    generator: torch.Generator | None,
 ) -> Tensor:
     """depth_mm (B, H, W), intrinsics (B, 4), camera_pose (B, 7), noise_level (B,) -> (B, num_visual_points,
     5).

@@ -11,7 +11,7 @@ from lerobot.lerobot_types import RobotAction, RobotObservation
 from lerobot.robots.robot import Robot
 from lerobot.utils.decorators import check_if_already_connected, check_if_not_connected
 
-from lerobot_vtrefine.datasets.features import JOINT_SUFFIX
+from lerobot_vtrefine.datasets.features import joint_keys
 from lerobot_vtrefine.drivers.arm_models import VIPERX_300S
 from lerobot_vtrefine.drivers.arm_pair import ArmPair
 from lerobot_vtrefine.drivers.dynamixel_arm import Floats
@@ -25,6 +25,7 @@ from lerobot_vtrefine.robots.camera_models import CameraModels
 from lerobot_vtrefine.robots.config_aloha_tactile_follower import AlohaTactileFollowerConfig
 from lerobot_vtrefine.robots.cut_commands import CutCommands
 from lerobot_vtrefine.robots.extensions import extend_lerobot
+from lerobot_vtrefine.robots.joint_targets import finite_targets
 from lerobot_vtrefine.robots.pad_reading import pad_observation
 
 logger = logging.getLogger(__name__)
@@ -78,7 +79,7 @@ class AlohaTactileFollower(WholeCalibrationFile, Robot):
     @cached_property
     def action_features(self) -> dict[str, Any]:
         """16 joint targets in the paper's order."""
-        return {f"{joint}{JOINT_SUFFIX}": float for joint in self.body.joint_names}
+        return dict.fromkeys(joint_keys(self.body), float)
 
     @property
     def _camera_features(self) -> dict[str, tuple[int, int, int]]:
@@ -208,10 +209,7 @@ class AlohaTactileFollower(WholeCalibrationFile, Robot):
         Raises:
             ValueError: a target is not a number; nothing is sent.
         """
-        wanted = np.array([action[key] for key in self.action_features], float)
-        if not np.isfinite(wanted).all():
-            wrong = [key for key in self.action_features if not np.isfinite(action[key])]
-            raise ValueError(f"the action's {', '.join(wrong)} must be finite: nothing was sent to the arms")
+        wanted = finite_targets(action, self.action_features)
         sent = []
         for index, arm in enumerate(self.pair.arms.values()):
             part = slice(index * PER_ARM, (index + 1) * PER_ARM)

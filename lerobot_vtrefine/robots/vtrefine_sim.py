@@ -21,10 +21,10 @@ from lerobot.utils.decorators import check_if_already_connected, check_if_not_co
 from lerobot_vtrefine.datasets.features import (
     CAMERA,
     IMAGE_PREFIX,
-    JOINT_SUFFIX,
     OBS_PREFIX,
     STATE_KEY,
     dataset_features,
+    joint_keys,
     raw_to_frame,
 )
 from lerobot_vtrefine.drivers.config import PadConfig
@@ -36,6 +36,7 @@ from lerobot_vtrefine.lerobot_compat.arrays import ArraySpec
 from lerobot_vtrefine.robots.config_vtrefine_sim import VtRefineSimConfig
 from lerobot_vtrefine.robots.cut_commands import CutCommands
 from lerobot_vtrefine.robots.extensions import extend_lerobot
+from lerobot_vtrefine.robots.joint_targets import finite_targets
 from lerobot_vtrefine.robots.simulated_pace import Pace
 from lerobot_vtrefine.wording import plural
 
@@ -103,7 +104,7 @@ class VtRefineSim(Robot):
     @cached_property
     def action_features(self) -> dict[str, Any]:
         """Absolute joint targets in the embodiment's order [rad, m]."""
-        return {f"{joint}{JOINT_SUFFIX}": float for joint in self.body.joint_names}
+        return dict.fromkeys(joint_keys(self.body), float)
 
     # --- connection ---------------------------------------------------------------------------------
 
@@ -172,10 +173,7 @@ class VtRefineSim(Robot):
         """
         began = time.perf_counter()
         # As datasets keep them: an episode that is replayed is then the same.
-        wanted = np.array([float(action[key]) for key in self.action_features], np.float32)
-        if not np.isfinite(wanted).all():
-            wrong = [key for key in self.action_features if not np.isfinite(float(action[key]))]
-            raise ValueError(f"the action's {', '.join(wrong)} must be finite: nothing was sent to the arms")
+        wanted = finite_targets(action, self.action_features).astype(np.float32)
         waits = self._waiting_steps > 0
         if not waits:
             self.world.step(wanted)

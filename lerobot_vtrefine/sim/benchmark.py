@@ -16,9 +16,8 @@ from lerobot_vtrefine.sim.config import SceneConfig, WarpConfig
 from lerobot_vtrefine.sim.expert import ScriptedExpert
 from lerobot_vtrefine.sim.simulation import InsertionSim
 
-WORLDS = (1, 64, 1024, 4096)
-STEPS = 40
-"""Control steps of one episode: the expert has inserted by then."""
+WHOLE_EPISODE = 40
+"""Control steps by which the expert has inserted."""
 REPEATS = 5
 """Each part alone is timed so often, in the middle of the insertion."""
 GIB = 2.0**30
@@ -53,11 +52,7 @@ class WorldsRow:
     """Taxels of one world."""
 
 
-def measure_worlds(
-    warp: WarpConfig,
-    worlds: Sequence[int] = WORLDS,
-    steps: int = STEPS,
-) -> Iterator[WorldsRow]:
+def measure_worlds(warp: WarpConfig, worlds: Sequence[int], steps: int) -> Iterator[WorldsRow]:
     """A row per number of worlds, on `warp.device`.
 
     Raises:
@@ -119,7 +114,7 @@ def _measure(warp: WarpConfig, count: int, steps: int) -> WorldsRow:
         times.append(_seconds(lambda: (sim.step(action, images=ids), sim.observe())))  # noqa: B023  called at once
         if step == steps // 2:
             parts = _parts(sim)
-    success = float(sim.metrics()["success"].mean()) if steps >= STEPS else float("nan")
+    success = float(sim.metrics()["success"].mean()) if steps >= WHOLE_EPISODE else float("nan")
     memory = _memory_gib(device) - (before if sim.device != "cpu" else 0.0)
     return WorldsRow(
         worlds=count,

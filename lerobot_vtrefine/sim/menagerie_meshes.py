@@ -129,7 +129,7 @@ class DrawnWorld:
         FileNotFoundError, ValueError: as `fit_meshes` does.
     """
 
-    def __init__(self, sim: "InsertionSim", env: int, menagerie_dir: Path | None = None) -> None:
+    def __init__(self, sim: "InsertionSim", env: int, menagerie_dir: Path | None) -> None:
         self._sim, self._env = sim, env
         simulated, _ = sim.mj_data(env)
         self.model = simulated if menagerie_dir is None else dressed(sim.scene, menagerie_dir)

@@ -19,7 +19,7 @@ MOVES = 4
 SAMPLES = 20_000
 
 
-def load_mesh_parts(name: str, mesh_dir: Path | None, scale: str | float = "flexitac") -> PartPair:
+def load_mesh_parts(name: str, mesh_dir: Path | None, scale: str | float) -> PartPair:
     """Load `automate/ID` from a folder of meshes; errors as in `load_mesh_pair`."""
     return make_parts(load_mesh_pair(name, mesh_dir, scale))
 

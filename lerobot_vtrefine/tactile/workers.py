@@ -27,7 +27,7 @@ class Workers:
         num_threads: threads, with the caller's; with one, everything runs there.
     """
 
-    def __init__(self, num_threads: int = 1) -> None:
+    def __init__(self, num_threads: int) -> None:
         self.num_threads = max(1, num_threads)
 
     def split(self, count: int, part: Part) -> None:

@@ -9,7 +9,7 @@ from lerobot.lerobot_types import RobotAction
 from lerobot.teleoperators.teleoperator import Teleoperator
 from lerobot.utils.decorators import check_if_already_connected, check_if_not_connected
 
-from lerobot_vtrefine.datasets.features import JOINT_SUFFIX
+from lerobot_vtrefine.datasets.features import joint_keys
 from lerobot_vtrefine.drivers.arm_models import WIDOWX_250S
 from lerobot_vtrefine.drivers.arm_pair import ArmPair
 from lerobot_vtrefine.embodiments import get_embodiment
@@ -38,7 +38,7 @@ class AlohaLeader(WholeCalibrationFile, Teleoperator):
     @cached_property
     def action_features(self) -> dict[str, Any]:
         """16 joint targets in the paper's order."""
-        return {f"{joint}{JOINT_SUFFIX}": float for joint in self.body.joint_names}
+        return dict.fromkeys(joint_keys(self.body), float)
 
     @property
     def feedback_features(self) -> dict[str, Any]:

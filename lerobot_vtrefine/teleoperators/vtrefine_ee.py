@@ -12,7 +12,7 @@ from lerobot.teleoperators.teleoperator import Teleoperator
 from lerobot.utils.decorators import check_if_already_connected, check_if_not_connected
 from scipy.spatial.transform import Rotation
 
-from lerobot_vtrefine.datasets.features import JOINT_SUFFIX
+from lerobot_vtrefine.datasets.features import joint_keys
 from lerobot_vtrefine.embodiments import get_embodiment
 from lerobot_vtrefine.extras import TELEOPERATION, require
 from lerobot_vtrefine.lerobot_compat import phases
@@ -53,7 +53,7 @@ class VtRefineEe(Teleoperator):
     @cached_property
     def action_features(self) -> dict[str, Any]:
         """Absolute joint targets in the embodiment's order."""
-        return {f"{joint}{JOINT_SUFFIX}": float for joint in self.body.joint_names}
+        return dict.fromkeys(joint_keys(self.body), float)
 
     @property
     def feedback_features(self) -> dict[str, Any]:

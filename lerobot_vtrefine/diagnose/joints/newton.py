@@ -104,7 +104,7 @@ class Refits:
         return (left**2).sum(0) / np.maximum(part.batch.frames, 1)[:, None]
 
 
-def refits(problem: ServoTrials, fit: Fit, channels: Array | None = None) -> Refits:
+def refits(problem: ServoTrials, fit: Fit, channels: Array | None) -> Refits:
     """Of all joints that are free, or of some, the delay then being kept."""
     if channels is not None:
         mask = np.isin(np.arange(len(fit.free)), channels)

@@ -181,7 +181,7 @@ def _solve(gram: np.ndarray, movable: np.ndarray, damping: float) -> np.ndarray:
     return step
 
 
-def free_step(model: Composite, gram: np.ndarray, held: Sequence[int] = ()) -> np.ndarray:
+def free_step(model: Composite, gram: np.ndarray, held: Sequence[int]) -> np.ndarray:
     """Change of all coordinates (p,) in one Gauss-Newton step without bounds."""
     step = np.zeros(len(model.values))
     free = np.setdiff1d(model.free, np.array(held, dtype=int))

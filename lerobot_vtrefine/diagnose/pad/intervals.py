@@ -80,7 +80,7 @@ def leave_out(fitted: Fit, presses: PressSet, held: Sequence[int] = ()) -> LeftO
     return LeftOut(fitted.model.values, fitted.model.values + np.array(steps), spread, len(fitted.grams))
 
 
-def deviations(fitted: Fit, held: Sequence[int] = ()) -> np.ndarray:
+def deviations(fitted: Fit, held: Sequence[int]) -> np.ndarray:
     """Principal deviations (q, p) of the coordinates from the inverse of their curvature."""
     free = np.setdiff1d(fitted.model.free, np.array(held, dtype=int))
     curvature = fitted.grams.sum(axis=0)[:-1, :-1]

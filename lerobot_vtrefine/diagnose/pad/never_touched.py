@@ -66,7 +66,7 @@ def never_touched(fitted: Fit, presses: PressSet) -> Suspicion | None:
 
 
 def surely_touched(
-    presses: PressSet, looks: frozenset[tuple[int, int]], errors: float = DEAD_ERRORS
+    presses: PressSet, looks: frozenset[tuple[int, int]], errors: float
 ) -> frozenset[tuple[int, int]]:
     """Those of the taxels that look dead which no plausible geometry makes sound ones.
 

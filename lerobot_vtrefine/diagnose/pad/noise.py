@@ -77,7 +77,7 @@ def fit_frame_noise(
     presses: PressSet,
     residuals: Sequence[np.ndarray],
     signals: Sequence[np.ndarray],
-    groups: tuple[int, ...] = (),
+    groups: tuple[int, ...],
 ) -> Noise:
     """Noise within recordings, from residuals (T, n) and expected signals (T, n) of a fitted model.
 

@@ -13,7 +13,7 @@ from lerobot_vtrefine.sim.backends.base import BAD_STATE_WARNINGS, Array, Backen
 class BatchBackend(Backend):
     """`mujoco.batch`: bit-identical to stepping each world alone, at any number of threads."""
 
-    def __init__(self, model: mujoco.MjModel, num_envs: int, num_threads: int = 0) -> None:
+    def __init__(self, model: mujoco.MjModel, num_envs: int, num_threads: int) -> None:
         self.num_envs = num_envs
         self._batch = Batch(model, nsim=num_envs, nthread=num_threads or usable_cores())
         self._qpos, self._qvel = self._batch.bind("qpos"), self._batch.bind("qvel")

@@ -77,9 +77,7 @@ class YieldingStiffness(CoverLaw):
         return _of_one_load(x / (1.0 + share) ** (1.0 / self.sharpness), x, frame), state
 
 
-def spreading_matrix(
-    count: int, sigma_taxels: torch.Tensor, kept: float | torch.Tensor = 1.0
-) -> torch.Tensor:
+def spreading_matrix(count: int, sigma_taxels: torch.Tensor, kept: float | torch.Tensor) -> torch.Tensor:
     """Gaussian weights (..., count, count) with mirrored ends: doubly stochastic, so that sums and flat
     fields are kept.
 
