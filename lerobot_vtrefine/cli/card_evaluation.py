@@ -8,7 +8,7 @@ from lerobot.utils.constants import CHECKPOINTS_DIR, LAST_CHECKPOINT_LINK, PRETR
 from lerobot_vtrefine.cli.arguments import flags
 from lerobot_vtrefine.cli.pipeline.stages import Stage, StageRunner, evaluation_stage
 from lerobot_vtrefine.cli.sharing import EPISODES, push_policy
-from lerobot_vtrefine.envs.config import VtRefineEnvConfig
+from lerobot_vtrefine.envs.config import checked_env
 from lerobot_vtrefine.envs.evaluation_note import changed_settings
 from lerobot_vtrefine.finetune.pipeline import FinetunePipelineConfig
 
@@ -21,13 +21,13 @@ def card_stage(cfg: FinetunePipelineConfig, checkpoint: Path) -> Stage:
 
     A policy that practised from a bank of states is judged from the table.
     """
-    assert isinstance(cfg.env, VtRefineEnvConfig)
     assert cfg.policy is not None
+    env = replace(checked_env(cfg.env), start_bank=None)
     output = cfg.output_dir / f"evaluation_{checkpoint.name}"
     judging = (
         f"--policy.path={checkpoint / PRETRAINED_MODEL_DIR}",
         f"--policy.device={cfg.policy.device}",
-        *flags("env", {"type": cfg.env.type} | changed_settings(replace(cfg.env, start_bank=None))),
+        *flags("env", {"type": cfg.env.type} | changed_settings(env)),
         f"--env.metrics_path={output / EPISODES}",
     )
     episodes, at_once = cfg.eval.n_episodes, cfg.eval.batch_size

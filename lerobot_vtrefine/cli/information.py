@@ -18,6 +18,7 @@ from lerobot_vtrefine.cli.errors import run_cli
 from lerobot_vtrefine.cli.outputs import OVERWRITE, staged
 from lerobot_vtrefine.cli.results.provenance import write_provenance
 from lerobot_vtrefine.envs import VtRefineEnvConfig
+from lerobot_vtrefine.envs.config import checked_env
 from lerobot_vtrefine.information.contact import SIDE, TOUCHING
 from lerobot_vtrefine.information.estimator import POLICY, SENSES
 from lerobot_vtrefine.information.page import render_page
@@ -48,8 +49,7 @@ class InformationConfig:
         unknown = [name for name in self.senses if name not in SENSES]
         if unknown or not self.senses:
             raise ValueError(f"--senses={','.join(self.senses)}: choose from {', '.join(SENSES)}")
-        if not isinstance(self.env, VtRefineEnvConfig):
-            raise ValueError(f"--env.type={self.env.type} has no scripted expert; use --env.type=vtrefine")
+        checked_env(self.env)
 
 
 class Bars:
@@ -96,8 +96,7 @@ def summary(found: Study) -> str:
 @parser.wrap()
 def information(cfg: InformationConfig) -> None:
     """Study one task and write what was found."""
-    env = cfg.env
-    assert isinstance(env, VtRefineEnvConfig)
+    env = checked_env(cfg.env)
     with staged(cfg.output_dir, FILES, overwrite=cfg.overwrite, flag=OVERWRITE) as folder:
         found = study(env, cfg.senses, cfg.effort, Bars(), save_keeper(folder, cfg.effort))
         write(found, cfg.effort, folder)

@@ -26,6 +26,7 @@ from lerobot_vtrefine.cli.playing.session import Session
 from lerobot_vtrefine.cli.report.statistics import wilson_interval
 from lerobot_vtrefine.embodiments.menagerie import FLAG as LOOKS
 from lerobot_vtrefine.envs import VtRefineEnvConfig
+from lerobot_vtrefine.envs.config import checked_env
 from lerobot_vtrefine.extras import VIEW, require
 from lerobot_vtrefine.shipped import expand
 
@@ -87,8 +88,8 @@ class PlayConfig:
     def __post_init__(self) -> None:
         check_choice("--viewer", self.viewer, VIEWERS)
         check_port("--port", self.port)
-        if self.env is not None and not isinstance(self.env, VtRefineEnvConfig):
-            raise ValueError(f"--env.type={self.env.type} cannot be played; use --env.type=vtrefine")
+        if self.env is not None:
+            checked_env(self.env)
         if self.episodes is not None and self.episodes < 1:
             raise ValueError(f"--episodes must be at least 1, got {self.episodes}")
         if self.seed is not None and self.seed < 0:
@@ -133,7 +134,7 @@ def play(config: PlayConfig) -> list[dict]:
 
 
 def _choose(config: PlayConfig) -> tuple[Agent, VtRefineEnvConfig, int]:
-    env = config.env if isinstance(config.env, VtRefineEnvConfig) else None
+    env = None if config.env is None else checked_env(config.env)
     if config.dataset.root is not None:
         agent, env, noted = recorded_agent(config.dataset.root, config.dataset.episode, env)
         if noted is None:

@@ -27,6 +27,7 @@ from lerobot_vtrefine.cli.sharing import push_dataset
 from lerobot_vtrefine.datasets.features import dataset_features
 from lerobot_vtrefine.embodiments import DEFAULT_BODY
 from lerobot_vtrefine.envs import VtRefineEnvConfig
+from lerobot_vtrefine.envs.config import checked_env
 from lerobot_vtrefine.envs.demo_dataset import DemoDataset
 from lerobot_vtrefine.envs.demo_workers import demonstration_stream
 from lerobot_vtrefine.envs.recording_note import simulation_settings
@@ -76,13 +77,11 @@ class RecordDemosConfig:
                 raise ValueError(f"--{name} must be at least {lowest}, got {getattr(self, name)}")
         if self.push_to_hub:
             check_upload(self.repo_id)
-        if not isinstance(self.env, VtRefineEnvConfig):
-            raise ValueError(f"--env.type={self.env.type} has no scripted expert; use --env.type=vtrefine")
+        checked_env(self.env)
 
     def settings(self) -> dict[str, Any]:
         """What determines the episodes."""
-        env = self.env
-        assert isinstance(env, VtRefineEnvConfig)
+        env = checked_env(self.env)
         more = {"truth": True} if self.truth else {}
         return (
             simulation_settings(env)
@@ -102,8 +101,7 @@ def record(config: RecordDemosConfig) -> int:
         ValueError: if the first ``HOPELESS_ATTEMPTS`` attempts all fail.
         OSError: if the disk is full.
     """
-    env = config.env
-    assert isinstance(env, VtRefineEnvConfig)
+    env = checked_env(config.env)
     robot = env.body
     features = dataset_features(
         *env.camera_size, robot, env.colour_size, env.limited, TRUTH_SIZE * config.truth
@@ -147,8 +145,7 @@ def record(config: RecordDemosConfig) -> int:
 
 def next_steps(config: RecordDemosConfig) -> str:
     """Commands that see the dataset and learn from it."""
-    env = config.env
-    assert isinstance(env, VtRefineEnvConfig)
+    env = checked_env(config.env)
     root = shlex.quote(str(config.root))
     train = f"lerobot-train --dataset.repo_id={shlex.quote(config.repo_id)} --dataset.root={root}"
     if env.scene.embodiment == DEFAULT_BODY:

@@ -24,6 +24,7 @@ from tqdm import tqdm
 from lerobot_vtrefine.cli.errors import after_interrupt, run_cli
 from lerobot_vtrefine.cli.outputs import check_file
 from lerobot_vtrefine.envs import VtRefineEnvConfig
+from lerobot_vtrefine.envs.config import checked_env
 from lerobot_vtrefine.envs.grasps import ExpertPlayer, Player, grasp_states
 from lerobot_vtrefine.envs.start_bank import StartBank, bank_settings
 from lerobot_vtrefine.sim.demonstrations import Degradation
@@ -69,9 +70,7 @@ class RecordStartsConfig:
         for name, lowest in (("num_starts", FEWEST), ("num_envs", 1), ("attempts", 1), ("seed", 0)):
             if getattr(self, name) < lowest:
                 raise ValueError(f"--{name} must be at least {lowest}, got {getattr(self, name)}")
-        if not isinstance(self.env, VtRefineEnvConfig):
-            raise ValueError(f"--env.type={self.env.type} has no states to save; use --env.type=vtrefine")
-        if self.env.scene_config.start != "table":
+        if checked_env(self.env).scene_config.start != "table":
             raise ValueError("parts are grasped from the table: use --env.start=table")
 
 
@@ -81,10 +80,8 @@ def record(config: RecordStartsConfig) -> dict[str, int]:
     Raises:
         ValueError: not even the expert gets hold of both parts often enough.
     """
-    env = config.env
-    assert isinstance(env, VtRefineEnvConfig)
     check_file("--path", config.path)
-    env = replace(env, start_bank=None, metrics_path=None)
+    env = replace(checked_env(config.env), start_bank=None, metrics_path=None)
     states: dict[int, Any] = {}
     counts: dict[str, int] = {}
     seed = config.seed

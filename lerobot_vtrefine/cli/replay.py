@@ -24,7 +24,7 @@ from lerobot_vtrefine.diagnose.episode_replay.compare import (
     compare_episodes,
     write_summary,
 )
-from lerobot_vtrefine.envs import VtRefineEnvConfig
+from lerobot_vtrefine.envs.config import checked_env
 
 FILES = ("replay.json", "report.html")
 
@@ -70,8 +70,8 @@ class ReplayConfig:
         check_choice("--parts", self.parts, PARTS)
         if self.episodes is not None and not self.episodes:
             raise ValueError("--episodes is empty; leave it out to replay all of them")
-        if self.env is not None and not isinstance(self.env, VtRefineEnvConfig):
-            raise ValueError(f"--env.type={self.env.type} cannot be the twin; use --env.type=vtrefine")
+        if self.env is not None:
+            checked_env(self.env)
 
 
 def replay(config: ReplayConfig) -> Comparison:
@@ -83,7 +83,7 @@ def replay(config: ReplayConfig) -> Comparison:
     """
     from lerobot_vtrefine.diagnose.episode_replay.page import render_page
 
-    env = config.env if isinstance(config.env, VtRefineEnvConfig) else None
+    env = None if config.env is None else checked_env(config.env)
     with staged(config.output_dir, FILES, overwrite=config.overwrite, flag=OVERWRITE) as folder:
         comparison = compare_episodes(
             _folder(config.dataset),

@@ -240,3 +240,10 @@ class VtRefineEnvConfig(EnvConfig):
         if self.colour_size is not None:
             features[RGB_KEY] = PolicyFeature(type=FeatureType.VISUAL, shape=(*self.colour_size, 3))
         return {ACTION_KEY: EnvAction.of(self.body, self.fps), **features}
+
+
+def checked_env(env: EnvConfig) -> VtRefineEnvConfig:
+    """The environment, if it is this package's. Raises: ValueError for another type."""
+    if not isinstance(env, VtRefineEnvConfig):
+        raise ValueError(f"this command needs --env.type=vtrefine, got {env.type}")
+    return env

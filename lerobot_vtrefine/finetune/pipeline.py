@@ -18,7 +18,7 @@ from lerobot.utils.constants import PRETRAINED_MODEL_DIR
 from lerobot.utils.random_utils import set_seed
 from tqdm import tqdm
 
-from lerobot_vtrefine.envs.config import VtRefineEnvConfig
+from lerobot_vtrefine.envs.config import VtRefineEnvConfig, checked_env
 from lerobot_vtrefine.envs.decisions import LeRobotDecisionEnv, make_decision_env
 from lerobot_vtrefine.files import read_json, read_yaml
 from lerobot_vtrefine.finetune.agents import CHAIN, check_same_chain, load_policy, make_agent
@@ -181,13 +181,6 @@ class Practice(NamedTuple):
     agent: Agent
     env: LeRobotDecisionEnv
     processors: tuple[Any, Any]
-
-
-def checked_env(env: EnvConfig) -> VtRefineEnvConfig:
-    """The environment, if it is one that DPPO can run; else ValueError."""
-    if not isinstance(env, VtRefineEnvConfig):
-        raise ValueError(f"vtrefine-finetune needs --env.type=vtrefine, got {env.type}")
-    return env
 
 
 def make_practice(policy: VtDp3Policy, path: Path, env: EnvConfig, dppo: DppoConfig) -> Practice:

@@ -12,7 +12,7 @@ from lerobot.configs import PreTrainedConfig
 from lerobot.envs import EnvConfig
 
 from lerobot_vtrefine.cli.errors import describe
-from lerobot_vtrefine.envs.config import VtRefineEnvConfig
+from lerobot_vtrefine.envs.config import VtRefineEnvConfig, checked_env
 from lerobot_vtrefine.finetune.config import DppoConfig
 from lerobot_vtrefine.policies.vt_dp3.configuration_vt_dp3 import VtDp3Config
 from lerobot_vtrefine.sim.demonstrations import Degradation
@@ -28,9 +28,7 @@ def parse_policy(values: Mapping[str, Any]) -> VtDp3Config:
 
 def parse_env(values: Mapping[str, Any]) -> VtRefineEnvConfig:
     """The environment of ``--env.KEY=VALUE``. Raises: ValueError that names the flag."""
-    parsed = _decode("env", EnvConfig, {"type": "vtrefine"} | dict(values))
-    if not isinstance(parsed, VtRefineEnvConfig):
-        raise ValueError(f"--env: the demo runs in vtrefine environments, not {parsed.type}")
+    parsed = checked_env(_decode("env", EnvConfig, {"type": "vtrefine"} | dict(values)))
     _ = parsed.scene_config  # its own checks
     return parsed
 
