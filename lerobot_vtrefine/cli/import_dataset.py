@@ -14,12 +14,12 @@ from lerobot.configs import parser
 from lerobot.utils.utils import init_logging
 
 from lerobot_vtrefine.cli.errors import run_cli
-from lerobot_vtrefine.datasets.features import JOINT_SUFFIX
+from lerobot_vtrefine.datasets.features import joint_keys
 from lerobot_vtrefine.datasets.importers.aloha_npz import read_aloha_npz
 from lerobot_vtrefine.datasets.importers.bam_logs import is_bam, read_bam, write_bam
 from lerobot_vtrefine.datasets.importers.joint_episodes import write_dataset, write_recording_set
 from lerobot_vtrefine.datasets.importers.leflexitac import import_leflexitac, is_leflexitac
-from lerobot_vtrefine.embodiments import get_embodiment
+from lerobot_vtrefine.embodiments import ALOHA
 from lerobot_vtrefine.wording import plural
 
 FORMATS = (
@@ -91,15 +91,12 @@ def _import_npz(config: ImportConfig, root: Path) -> str:
     if config.pads:
         raise ValueError("--pads has no meaning here: the npz holds no pads")
     episodes = read_aloha_npz(config.source)
-    joints = get_embodiment("aloha").joint_names
     if config.recording_dir is not None and config.recording_dir.exists():
         raise FileExistsError(f"{config.recording_dir} exists; choose another --recording_dir or remove it")
-    names = [
-        f"{joint}{JOINT_SUFFIX}" for joint in joints
-    ]  # as robots record them: lerobot-replay reads these
+    names = joint_keys(ALOHA)  # as robots record them: lerobot-replay reads these
     write_dataset(episodes, names, root, config.repo_id, config.fps, config.task)
     if config.recording_dir is not None:
-        write_recording_set(episodes, joints, config.recording_dir, config.fps)
+        write_recording_set(episodes, ALOHA.joint_names, config.recording_dir, config.fps)
     frames = sum(len(episode.command) for episode in episodes)
     return f"{plural(len(episodes), 'episode')}, {plural(frames, 'frame')}, no touch -> {root}"
 

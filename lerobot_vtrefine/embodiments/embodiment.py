@@ -245,32 +245,6 @@ class Embodiment:
         """
         return self.hands(q).pads()
 
-    def pad_twists(self, q: "Tensor", qd: "Tensor") -> "Tensor":
-        """Velocities of the pads' frames.
-
-        Args:
-            q: joint positions (..., J).
-            qd: joint velocities (..., J) [rad/s, m/s].
-
-        Returns:
-            (..., P, 6): linear velocity of the pad's origin [m/s], then angular velocity [rad/s], in the
-            world frame.
-        """
-        return self.hands(q).pad_twists(qd)
-
-    def tcp_jacobian(self, q: "Tensor") -> "Tensor":
-        """Geometric Jacobian of each TCP with respect to its own arm's revolute joints.
-
-        Args:
-            q: joint positions (..., J).
-
-        Returns:
-            (..., A, 6, joints): linear rows first [m/rad], then angular, in the world frame.
-        """
-        from lerobot_vtrefine.embodiments import kinematics
-
-        return kinematics.tcp_jacobian(self, q)
-
     def solve_tcp(
         self, position: "Tensor", rotation: "Tensor", initial: "Tensor", iterations: int = 30
     ) -> "Tensor":

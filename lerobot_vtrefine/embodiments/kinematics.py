@@ -46,6 +46,12 @@ class Hands:
             reach = reach.unsqueeze(-1)
         return self.position + reach * self.rotation[..., 0], self.rotation
 
+    def tcp_jacobian(self) -> Tensor:
+        """(..., A, 6, K) of each TCP in its own arm's revolute joints: linear rows first, world frame."""
+        position, _ = self.tcp()
+        linear = torch.linalg.cross(self.axes, position.unsqueeze(-2) - self.origins)
+        return torch.cat([linear, self.axes], -1).transpose(-1, -2)
+
     @property
     def _grippers(self) -> Tensor:
         """(..., A, F)"""
@@ -115,14 +121,6 @@ def hands(embodiment: "Embodiment", q: Tensor) -> Hands:
     return Hands(embodiment, q, position, *frames)
 
 
-def tcp_jacobian(embodiment: "Embodiment", q: Tensor) -> Tensor:
-    """(..., A, 6, K) of each TCP in its own arm's revolute joints."""
-    chain = hands(embodiment, q)
-    position, _ = chain.tcp()
-    linear = torch.linalg.cross(chain.axes, position.unsqueeze(-2) - chain.origins)
-    return torch.cat([linear, chain.axes], -1).transpose(-1, -2)
-
-
 def solve_tcp(
     embodiment: "Embodiment", position: Tensor, rotation: Tensor, initial: Tensor, iterations: int
 ) -> Tensor:
@@ -132,9 +130,10 @@ def solve_tcp(
     count = len(embodiment.joints)
     eye = _IK_DAMPING * torch.eye(count, dtype=q.dtype, device=q.device)
     for _ in range(iterations):
-        now_position, now_rotation = embodiment.tcp_poses(q)
+        chains = hands(embodiment, q)
+        now_position, now_rotation = chains.tcp()
         error = torch.cat([position - now_position, rotation_error(now_rotation, rotation)], -1)
-        jacobian = tcp_jacobian(embodiment, q)
+        jacobian = chains.tcp_jacobian()
         transposed = jacobian.transpose(-1, -2)
         step = torch.linalg.solve(transposed @ jacobian + eye, transposed @ error.unsqueeze(-1)).squeeze(-1)
         largest = step.abs().amax(-1, keepdim=True)

@@ -115,7 +115,9 @@ def test_every_body_stands_in_its_scene_as_its_kinematics_say() -> None:
         after, before = (KINOVA.pad_poses(torch.from_numpy(q) + sign * step * rates) for sign in (1, -1))
         turning = ((after[1] - before[1]) / (2 * step)) @ rotation.transpose(-1, -2)
         twist = torch.cat([(after[0] - before[0]) / (2 * step), turning[:, [2, 0, 1], [1, 2, 0]]], -1)
-        torch.testing.assert_close(KINOVA.pad_twists(torch.from_numpy(q), rates), twist, atol=1e-7, rtol=0)
+        torch.testing.assert_close(
+            KINOVA.hands(torch.from_numpy(q)).pad_twists(rates), twist, atol=1e-7, rtol=0
+        )
 
 
 def test_four_bar_closes_and_turns_its_pads() -> None:

@@ -82,7 +82,7 @@ def test_pad_frames_are_right_handed():
 def test_twists_are_the_derivatives_of_the_poses():
     q = torch.from_numpy(joint_samples(10))
     qd = torch.from_numpy(np.random.default_rng(1).normal(size=(10, 16)))
-    twist = ALOHA.pad_twists(q, qd)
+    twist = ALOHA.hands(q).pad_twists(qd)
     poses, rates = torch.func.jvp(ALOHA.pad_poses, (q,), (qd,))
     torch.testing.assert_close(twist[..., :3], rates[0])
     spin = rates[1] @ poses[1].transpose(-1, -2)
@@ -93,7 +93,7 @@ def test_twists_are_the_derivatives_of_the_poses():
 def test_jacobian_is_the_derivative_of_the_tcp():
     q = torch.from_numpy(joint_samples(1)[0])
     numeric = torch.autograd.functional.jacobian(lambda x: ALOHA.tcp_poses(x)[0], q)
-    jacobian = ALOHA.tcp_jacobian(q)
+    jacobian = ALOHA.hands(q).tcp_jacobian()
     torch.testing.assert_close(jacobian[0, :3], numeric[0][:, :6])
     torch.testing.assert_close(jacobian[1, :3], numeric[1][:, 8:14])
 
