@@ -32,7 +32,12 @@ def whole_file(path: Path) -> Generator[Path]:
     sync(path.parent)
 
 
+def write_text(path: Path, text: str) -> None:
+    """Write a text in UTF-8."""
+    with whole_file(path) as part:
+        part.write_text(text, encoding="utf-8")
+
+
 def write_json(path: Path, data: Any) -> None:
     """Write ``data`` as LeRobot does, but whole."""
-    with whole_file(path) as part:
-        part.write_text(json.dumps(data, indent=4, ensure_ascii=False), encoding="utf-8")
+    write_text(path, json.dumps(data, indent=4, ensure_ascii=False))

@@ -6,7 +6,6 @@ finite, unknown names, a status that its causes contradict.
 
 import json
 import math
-import os
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -14,6 +13,7 @@ from typing import Any, Literal, get_args
 
 from lerobot_vtrefine.choices import check_choice
 from lerobot_vtrefine.files import decode, limits, read_json
+from lerobot_vtrefine.whole_files import write_text
 
 SCHEMA = "vtrefine/verdict@1"
 
@@ -220,7 +220,7 @@ class VerdictFile:
 def write_verdict(verdict: Verdict, path: str | Path) -> None:
     """Write verdict.json, whole or not at all."""
     text = json.dumps(verdict.to_dict(), indent=2, allow_nan=False, default=_plain)
-    write_atomically(path, text + "\n")
+    write_text(Path(path), text + "\n")
 
 
 def read_verdict(path: str | Path) -> Verdict:
@@ -230,14 +230,6 @@ def read_verdict(path: str | Path) -> Verdict:
         return Verdict.from_dict(data)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
-
-
-def write_atomically(path: str | Path, text: str) -> None:
-    """Write a text file so that a reader sees the old content or the new, never a part."""
-    path = Path(path)
-    partial = path.with_name(f".{path.name}.partial")
-    partial.write_text(text)
-    os.replace(partial, path)  # noqa: PTH105  atomic on one file system, and says so
 
 
 def _plain(value: Any) -> Any:

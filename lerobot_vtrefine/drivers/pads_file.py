@@ -9,7 +9,7 @@ import yaml
 
 from lerobot_vtrefine.drivers.config import PadConfig
 from lerobot_vtrefine.files import decode, read_yaml
-from lerobot_vtrefine.whole_files import whole_file
+from lerobot_vtrefine.whole_files import write_text
 
 _NAME = re.compile(r"\w[\w.-]{0,99}")
 _HEADER = "# FlexiTac pads by name, from vtrefine-find-pads. Ports name USB sockets: do not swap cables.\n"
@@ -22,8 +22,7 @@ def save_pads(pads: dict[str, PadConfig], path: Path) -> None:
         name: {key: value for key, value in asdict(pad).items() if key == "port" or value != defaults[key]}
         for name, pad in pads.items()
     }
-    with whole_file(path) as part:
-        part.write_text(_HEADER + yaml.safe_dump({"pads": entries}, sort_keys=False), encoding="utf-8")
+    write_text(path, _HEADER + yaml.safe_dump({"pads": entries}, sort_keys=False))
 
 
 def load_pads(path: Path) -> dict[str, PadConfig]:

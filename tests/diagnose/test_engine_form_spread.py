@@ -54,7 +54,7 @@ def test_intervals_of_fresh_sets_hold_the_truth() -> None:
 
 def test_forms_of_hardening_report_the_same_exponent() -> None:
     """The local exponent of force over depth at the deepest press, against the stages themselves."""
-    setting = Setting(PadLayout(4, 4, 0.002), 100.0, 255.0, 0.033, 10.0, 700.0, 7e-4, False, 0.0, 4, 4, 300.0)
+    setting = Setting(PadLayout(4, 4, 0.002), 100.0, 255.0, 0.033, 10.0, 700.0, 7e-4, False, 4, 4, 300.0)
     frame = Frame(setting.layout, stiffness_n_per_m=1000.0)
     laws = ([0.4], [0.4], [0.3, 1.5], [2.0, 0.4, np.log(0.01)], [0.8, 1.3])
     for form, values in [*zip(FORMS, laws, strict=True), (FORMS[0], [-0.3])]:

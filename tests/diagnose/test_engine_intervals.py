@@ -74,7 +74,7 @@ def test_a_parameter_that_overflows_is_taken_at_its_coordinates_end() -> None:
     form = Form(
         "latency", "", (value,), lambda v, s: (), lambda v, s: {"a": (math.exp(v[0]), "1")}, lambda s: []
     )
-    setting = Setting(PadLayout(4, 4, 0.002), 100.0, 255.0, 0.033, 6.0, 600.0, 1e-3, False, 0.0, 4, 4, 300.0)
+    setting = Setting(PadLayout(4, 4, 0.002), 100.0, 255.0, 0.033, 6.0, 600.0, 1e-3, False, 4, 4, 300.0)
     of = _reporter(form, setting, "a", slice(0, 1))
     assert of(np.array([1e4])) == pytest.approx(math.exp(3.0))
 
@@ -139,7 +139,7 @@ def test_periods_that_repeat_the_same_frames_are_the_interval() -> None:
 
 def test_ends_of_coordinates_bound_only_a_parameter_that_lies_between_them() -> None:
     layout = PadLayout(4, 4, 0.002)
-    setting = Setting(layout, 100.0, 255.0, 0.033, 6.0, 600.0, 1e-3, False, 0.0, 4, 4, 300.0)
+    setting = Setting(layout, 100.0, 255.0, 0.033, 6.0, 600.0, 1e-3, False, 4, 4, 300.0)
     linear = DRIFTS[0]
     level = replace(linear, report=lambda values, setting: {"rate_counts_per_s": (0.0, "counts/s")})
     falling = (-0.02, -0.01)

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, ClassVar, get_type_hints
 
 from lerobot_vtrefine.choices import check_choice
-from lerobot_vtrefine.whole_files import whole_file
+from lerobot_vtrefine.whole_files import write_text
 
 COMMIT = re.compile(r"[0-9a-f]{7,40}\+?")
 IMITATION, SCRATCH, TUNED = "imitation", "without pre-training", ""
@@ -232,5 +232,4 @@ def write_rows(path: Path, rows: Iterable[Row]) -> None:
         shown = {name: value for name, value in asdict(row).items() if value != unset[name]}
         origin = {name: shown.pop(name) for name in ("commit", "command", "machine")}
         lines.append(json.dumps(shown | origin, ensure_ascii=False))
-    with whole_file(path) as part:
-        part.write_text('{"rows": [\n' + ",\n".join(lines) + "\n]}\n", encoding="utf-8")
+    write_text(path, '{"rows": [\n' + ",\n".join(lines) + "\n]}\n")

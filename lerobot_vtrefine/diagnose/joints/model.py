@@ -12,8 +12,8 @@ from lerobot_vtrefine.diagnose.joints.batch import Batch, make_batch
 from lerobot_vtrefine.diagnose.joints.parameters import PARAMETERS, SAG
 from lerobot_vtrefine.diagnose.joints.servo_trials import Point, ServoTrials
 from lerobot_vtrefine.diagnose.recordings import RobotTrial
-from lerobot_vtrefine.diagnose.verdict import write_atomically
 from lerobot_vtrefine.embodiments.robot_file import SCHEMA, JointModel, SagForm, read_robot_file
+from lerobot_vtrefine.whole_files import write_text
 from lerobot_vtrefine.wording import plural
 
 __all__ = ["SCHEMA", "JointModel", "RobotModel", "predict_positions"]
@@ -65,7 +65,7 @@ class RobotModel:
 
     def save(self, path: str | Path) -> None:
         """Write the file, whole or not at all."""
-        write_atomically(path, json.dumps(self.to_dict(), indent=2, allow_nan=False) + "\n")
+        write_text(Path(path), json.dumps(self.to_dict(), indent=2, allow_nan=False) + "\n")
 
     @classmethod
     def load(cls, path: str | Path) -> "RobotModel":

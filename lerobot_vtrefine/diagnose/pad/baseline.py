@@ -69,7 +69,6 @@ def describe(presses: PressSet) -> Setting:
         frame_s=frame_s,
         duration_s=float(np.median(spans)),
         session_s=float(np.ptp(starts)),
-        session_start_s=float(min(starts)),
         top_depth_m=_reach(depth, presses.loaded),
         loaded=presses.loaded,
         touched_rows=int(touched.any(axis=1).sum()),

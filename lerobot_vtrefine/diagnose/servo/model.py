@@ -12,8 +12,8 @@ from lerobot_vtrefine.diagnose.recordings import RecordingSet, RobotTrial
 from lerobot_vtrefine.diagnose.servo.bench import Bench
 from lerobot_vtrefine.diagnose.servo.parameters import INDEX, LIMITS, PARAMETERS, WEIGHT_POWER
 from lerobot_vtrefine.diagnose.servo.simulation import simulate
-from lerobot_vtrefine.diagnose.verdict import write_atomically
 from lerobot_vtrefine.files import decode, limits, read_json
+from lerobot_vtrefine.whole_files import write_text
 
 SCHEMA = "vtrefine/servo-model@1"
 
@@ -69,7 +69,7 @@ class ServoModel:
 
     def save(self, path: str | Path) -> None:
         """Write the file, whole or not at all."""
-        write_atomically(path, json.dumps(self.to_dict(), indent=2, allow_nan=False) + "\n")
+        write_text(Path(path), json.dumps(self.to_dict(), indent=2, allow_nan=False) + "\n")
 
     @classmethod
     def load(cls, path: str | Path) -> "ServoModel":

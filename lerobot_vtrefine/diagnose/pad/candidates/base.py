@@ -30,8 +30,6 @@ class Setting:
     top_depth_m: float
     loaded: bool
     """Driven by the load: nothing before the force can be fitted."""
-    session_start_s: float
-    """Session time of the first recording [s]."""
     touched_rows: int
     touched_cols: int
     rest_session_s: float
