@@ -81,17 +81,10 @@ class RecordDemosConfig:
 
     def settings(self) -> dict[str, Any]:
         """What determines the episodes."""
-        env = checked_env(self.env)
-        more = {"truth": True} if self.truth else {}
-        return (
-            simulation_settings(env)
-            | more
-            | {
-                "degradation": asdict(self.degradation),
-                "seed": self.seed,
-                "include_failures": self.include_failures,
-            }
-        )
+        settings = simulation_settings(checked_env(self.env))
+        settings |= {"truth": True} if self.truth else {}
+        settings |= {"degradation": asdict(self.degradation), "seed": self.seed}
+        return settings | {"include_failures": self.include_failures}
 
 
 def record(config: RecordDemosConfig) -> int:

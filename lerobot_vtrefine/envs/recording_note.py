@@ -31,21 +31,17 @@ def simulation_settings(env: VtRefineEnvConfig) -> dict[str, Any]:
     files = {"reality": env.reality, "start_bank": env.start_bank, MODEL: model if model.is_file() else None}
     hidden = {name: fingerprint(path) for name, path in files.items() if path is not None}
     colour = {} if env.colour_size is None else {"colour": list(env.colour_size)}
-    return (
-        hidden
-        | _ablation(env)
-        | colour
-        | {
-            "scene": {
-                key: str(value) if isinstance(value, Path) else value
-                for key, value in asdict(known.scene_config).items()
-            },
-            "rules": asdict(env.task_config),
-            "randomization": asdict(env.randomization),
-            "sensor_model": env.sensor_model,
-            "task": env.task,
-        }
-    )
+    scene = asdict(known.scene_config)
+    return {
+        **hidden,
+        **_ablation(env),
+        **colour,
+        "scene": {key: str(value) if isinstance(value, Path) else value for key, value in scene.items()},
+        "rules": asdict(env.task_config),
+        "randomization": asdict(env.randomization),
+        "sensor_model": env.sensor_model,
+        "task": env.task,
+    }
 
 
 def _ablation(env: VtRefineEnvConfig) -> dict[str, str]:

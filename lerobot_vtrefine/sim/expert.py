@@ -153,10 +153,10 @@ class ScriptedExpert:
         self._entered = np.zeros(count, bool)
         self._press_m = np.full(count, PRESS_M)
 
-    def reset(self, ids: Ids, seeds: Ids | None = None) -> None:
+    def reset(self, ids: Ids) -> None:
         """Start new episodes of environments `ids` (m,) after the simulation was reset, by its seeds."""
         ids = np.asarray(ids)
-        self._errors.draw(ids, np.asarray(self._sim.seeds[ids] if seeds is None else seeds))
+        self._errors.draw(ids, self._sim.seeds[ids])
         view = self._observe(ids)
         self._step[ids] = 0
         self._target[ids] = view.q
@@ -231,8 +231,7 @@ class ScriptedExpert:
         goal = self._destination(ids, phase, view)
         if self._stands:  # the hand that would hold the socket rests, open
             self._opening[ids, LEFT] = self._robot.fingers.travel_m
-            rest = self._wanted[ids]
-            goal.position[:, LEFT], goal.rotation[:, LEFT] = rest.position[:, LEFT], rest.rotation[:, LEFT]
+            goal.assign(np.s_[:, LEFT], self._wanted[ids][:, LEFT])
         self._goal.assign(ids, goal)
         pace = PACES[phase]
         way = _distance(self._start[ids], self._goal[ids], pace.turn_m_per_rad)
@@ -256,10 +255,8 @@ class ScriptedExpert:
             return stations @ self._held[ids]
         goal = self._wanted[ids]
         if phase == Phase.ALIGN:
-            above = self._aligned(ids, view)
-            goal.position[:, RIGHT], goal.rotation[:, RIGHT] = above.position, above.rotation
-            met = _met_halfway(view) @ self._held[ids][:, LEFT]
-            goal.position[:, LEFT], goal.rotation[:, LEFT] = met.position, met.rotation
+            goal.assign(np.s_[:, RIGHT], self._aligned(ids, view))
+            goal.assign(np.s_[:, LEFT], _met_halfway(view) @ self._held[ids][:, LEFT])
         return goal
 
     def _stations_now(self, view: View) -> Poses:
@@ -267,8 +264,7 @@ class ScriptedExpert:
         stations = self._stations @ Poses.identity(len(view.q), 2)
         if self._stands:
             above = Poses.from_vectors(np.array([0.0, 0.0, self._pair.mouth_z_m + CARRY_M]), np.zeros(3))
-            plug = view.parts[:, LEFT] @ above
-            stations.position[:, RIGHT], stations.rotation[:, RIGHT] = plug.position, plug.rotation
+            stations.assign(np.s_[:, RIGHT], view.parts[:, LEFT] @ above)
         return stations
 
     def _plan(self, ids: Ids, view: View) -> Poses:
@@ -280,13 +276,9 @@ class ScriptedExpert:
         wanted = self._start[ids].towards(goal, np.repeat(smooth[:, None], 2, 1))
         if aligning.any():
             over = self._brought(ids[aligning], view[aligning], smooth[aligning])
-            wanted.position[aligning, RIGHT], wanted.rotation[aligning, RIGHT] = over.position, over.rotation
+            wanted.assign((aligning, RIGHT), over)
         if inserting.any():
-            down = self._inserted(ids[inserting], view[inserting])
-            wanted.position[inserting, RIGHT], wanted.rotation[inserting, RIGHT] = (
-                down.position,
-                down.rotation,
-            )
+            wanted.assign((inserting, RIGHT), self._inserted(ids[inserting], view[inserting]))
         return wanted
 
     def _aligned(self, ids: Ids, view: View) -> Poses:
