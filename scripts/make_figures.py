@@ -7,7 +7,6 @@ MENAGERIE_DIR=mujoco_menagerie python scripts/make_figures.py looks    # needs M
 
 import json
 import os
-import subprocess
 import sys
 import tempfile
 from collections.abc import Callable
@@ -20,6 +19,7 @@ import matplotlib as mpl
 import numpy as np
 from figures.common import GREY, IMAGES
 from figures.learning import draw_dppo, draw_paper, draw_rate, draw_results
+from runs.side_by_side import run_one
 
 from lerobot_vtrefine.cli.arguments import CommandParser
 from lerobot_vtrefine.cli.errors import run_cli
@@ -216,22 +216,13 @@ def draw_diagnosis(plt: Any) -> None:
 
     with tempfile.TemporaryDirectory() as folder:
         work = Path(folder)
-        commands = [
-            ["press", f"--output_dir={work / 'presses'}"],
-            ["diagnose", f"--recording={work / 'presses'}", f"--output_dir={work / 'out'}"],
-            *(
-                [
-                    "predict",
-                    f"--recording={work / 'presses'}",
-                    f"--sensor_model={work / 'out' / f'{name}_model.json'}",
-                    f"--output_dir={work / name}",
-                ]
-                for name in ("baseline", "sensor")
-            ),
-        ]
-        for command, *arguments in commands:
-            subprocess.run([sys.executable, "-m", f"lerobot_vtrefine.cli.{command}", *arguments], check=True)
-        trials = json.loads((work / "presses" / "recording.json").read_text(encoding="utf-8"))["trials"]
+        presses, out = work / "presses", work / "out"
+        command("press", f"--output_dir={presses}")
+        command("diagnose", f"--recording={presses}", f"--output_dir={out}")
+        for name in ("baseline", "sensor"):
+            model = f"--sensor_model={out / f'{name}_model.json'}"
+            command("predict", f"--recording={presses}", model, f"--output_dir={work / name}")
+        trials = json.loads((presses / "recording.json").read_text(encoding="utf-8"))["trials"]
         flat = next(trial["file"] for trial in trials if trial["object"]["shape"] == "flat")
         images = [
             np.stack(pq.read_table(work / name / flat)["raw"].to_numpy()).astype(float)
@@ -250,6 +241,11 @@ def draw_diagnosis(plt: Any) -> None:
         ax.set_xlabel("mm")
     figure.colorbar(picture, ax=axes, label="counts above idle", shrink=0.9)
     figure.savefig(IMAGES / "diagnosis.png")
+
+
+def command(name: str, *arguments: str) -> None:
+    """Run one of this package's commands."""
+    run_one([sys.executable, "-m", f"lerobot_vtrefine.cli.{name}", *arguments])
 
 
 def rms(values: np.ndarray) -> float:

@@ -16,6 +16,10 @@ import sys
 import time
 from pathlib import Path
 
+from runs.side_by_side import run_one
+
+from lerobot_vtrefine.cli.errors import run_cli
+
 ROOT = Path(__file__).parents[1]
 FOLDER = ROOT / "outputs" / "release"
 NAME = "lerobot_policy_vtrefine"
@@ -71,27 +75,23 @@ def run(command: list[str], **options: object) -> None:
     started = time.monotonic()
     shown = command[-1] if command[0] == "bash" else " ".join(command)
     print(f"$ {shown.replace(str(ROOT) + '/', '')}", flush=True)
-    subprocess.run(command, check=True, **options)  # ty: ignore[no-matching-overload]
+    run_one(command, **options)
     print(f"  {time.monotonic() - started:.1f} s", flush=True)
 
 
-def main() -> int:
+@run_cli
+def main() -> None:
     """Build, check, try."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--dist_only", action="store_true", help="build and check metadata, install nothing")
     options = parser.parse_args()
-    try:
-        uv = find_uv()
-        wheel = build(uv)
-        if not options.dist_only:
-            try_out(uv, wheel)
-    except (subprocess.CalledProcessError, FileNotFoundError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 1
+    uv = find_uv()
+    wheel = build(uv)
+    if not options.dist_only:
+        try_out(uv, wheel)
     print(f"{wheel.relative_to(ROOT)} is fit to be released")
-    return 0
 
 
 if __name__ == "__main__":

@@ -5,7 +5,8 @@ import re
 import shutil
 import subprocess
 import sys
-from collections.abc import Mapping
+from collections.abc import Generator, Mapping
+from functools import cache
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
@@ -40,9 +41,18 @@ FORBIDDEN_WITHIN = {"diagnose": ("policies", "finetune")}
 
 MAX_FILE_LINES = 400
 MAX_FUNCTION_LINES = 60
+STARTING = {f"subprocess.{name}" for name in ("run", "call", "check_call", "check_output", "Popen")}
 LONG_FUNCTIONS_ALLOWED = ("lerobot_vtrefine/finetune/dppo.py",)  # the training loop reads best in one piece
 
 
+@pytest.fixture(scope="module", autouse=True)
+def _trees_go() -> Generator[None]:
+    """A million objects that the garbage collector would look through in the tests of other files."""
+    yield
+    tree_of.cache_clear()
+
+
+@cache
 def tree_of(path: Path) -> ast.Module:
     return ast.parse(path.read_text(encoding="utf-8"), filename=str(path))
 
@@ -223,6 +233,17 @@ def test_library_does_not_print() -> None:
         if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "print"
     ]
     assert printing == []
+
+
+def test_scripts_start_commands_that_end_with_them() -> None:
+    """``runs.side_by_side`` and ``own_sessions`` do; what subprocess starts goes on when a script is ended."""
+    starting = [
+        f"{relative(path)}:{node.lineno}"
+        for path in sorted((ROOT / "scripts").rglob("*.py"))
+        for node in ast.walk(tree_of(path))
+        if isinstance(node, ast.Call) and ast.unparse(node.func) in STARTING
+    ]
+    assert starting == []
 
 
 def test_no_bare_except_and_no_grab_bag_modules() -> None:

@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 from lerobot_vtrefine.cli.pipeline.stages import own_sessions
 
@@ -47,6 +48,18 @@ def run_all(commands: Commands, jobs: int, needs: Needs | None = None) -> None:
         failed = run(commands, queue, start)
     if failed:
         raise failed[0]
+
+
+def run_one(command: Sequence[str], **options: Any) -> None:
+    """Run a command in sight, with the options of ``subprocess.Popen``; it ends with this process.
+
+    Raises:
+        subprocess.CalledProcessError: it failed.
+    """
+    with own_sessions() as start:
+        status = start(command, **options).wait()
+    if status:
+        raise subprocess.CalledProcessError(status, command)
 
 
 class Queue:

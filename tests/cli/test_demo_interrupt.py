@@ -133,6 +133,14 @@ folder, jobs, command = Path(sys.argv[1]), int(sys.argv[2]), sys.argv[3:]
 raise SystemExit(run_cli(lambda: run_all({folder / name: command for name in ("a", "b")[:jobs]}, jobs))())
 """
 
+RELEASE_CHECK = """
+import sys
+from lerobot_vtrefine.cli.errors import run_cli
+from release_check import run
+
+raise SystemExit(run_cli(lambda: run(sys.argv[2:]))())
+"""
+
 
 def begin(code: str, folder: Path, *arguments: str, takes_s: float, **options) -> subprocess.Popen[str]:
     """A runner of the command above."""
@@ -177,6 +185,15 @@ def test_commands_of_a_script_may_save_before_they_end(tmp_path: Path, jobs: int
     running.send_signal(number)
     _, errors = running.communicate(timeout=60)
     assert (running.returncode, errors.splitlines()[-1]) == (128 + number, "interrupted")
+    assert (tmp_path / "saved").is_file()
+
+
+def test_what_a_release_is_checked_by_ends_with_the_check(tmp_path: Path) -> None:
+    running = begin(RELEASE_CHECK, tmp_path, takes_s=0.0)
+    text_of(tmp_path / "begun", running)
+    running.terminate()
+    _, errors = running.communicate(timeout=60)
+    assert (running.returncode, errors.splitlines()[-1]) == (128 + signal.SIGTERM, "interrupted")
     assert (tmp_path / "saved").is_file()
 
 

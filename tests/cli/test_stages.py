@@ -11,7 +11,7 @@ import pytest
 from tqdm import tqdm
 
 from lerobot_vtrefine.cli.pipeline.progress import ChildProgress, LiveLine, parse_progress, read_tail
-from lerobot_vtrefine.cli.pipeline.stages import Stage, StageRunner, find_command, stage_keys
+from lerobot_vtrefine.cli.pipeline.stages import Stage, StageRunner, find_command, own_sessions, stage_keys
 
 WRITE = (
     "import pathlib, sys; p = pathlib.Path(sys.argv[1]); "
@@ -143,6 +143,13 @@ def test_keys_follow_commands_and_needs(tmp_path: Path) -> None:
     assert one["a"] != two["a"]
     assert one["b"] != two["b"]
     assert one["c"] == two["c"]
+
+
+def test_nothing_is_ended_where_all_have_ended() -> None:
+    ended: list[tuple] = []
+    with own_sessions(lambda *children: ended.append(children)) as start:
+        start(["true"]).wait()
+    assert ended == []
 
 
 def test_unknown_command_is_named() -> None:

@@ -300,7 +300,8 @@ def own_sessions(ending: Callable[..., None] = stop) -> Generator[Callable[..., 
         try:
             yield start
         finally:
-            ending(*(child for child in children if child.poll() is None))
+            if running := [child for child in children if child.poll() is None]:
+                ending(*running)
 
 
 def _hear_interrupts(prepare: Callable[[], None] | None) -> None:

@@ -35,7 +35,9 @@ def levels_of_neighbours(presses: PressSet, residuals: Sequence[Array], seed: in
         return None
     signs = 2.0 * np.random.default_rng([seed, 12]).integers(0, 2, (FLIPS + 1, number.size)) - 1.0
     signs[0] = 1.0
-    drawn = (signs[:, one] * signs[:, next_to_it]) @ products.sum(axis=0)
+    together = np.zeros((number.size, number.size))
+    together[one, next_to_it] = products.sum(axis=0)
+    drawn = ((signs @ together) * signs).sum(axis=1)
     total = sum(float(np.mean(residual**2)) for residual in residuals) / len(residuals)
     part = float(products.sum()) / pairs / max(total, 1e-12)
     clue = f"idle levels of neighbouring taxels move together ({100 * part:.0f} % of what is left)"
