@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from loaded_process import LoadedProcess, loaded_process
 
 LONGEST = (
     "policies/test_stock_commands.py",
@@ -87,6 +88,13 @@ def _ordinary_priority() -> Generator[None]:
 
     with ordinary_priority():
         yield
+
+
+@pytest.fixture(scope="session")
+def loaded(tmp_path_factory: pytest.TempPathFactory) -> Generator[LoadedProcess]:
+    """A process of which copies run what must not see this one's imports."""
+    with loaded_process(tmp_path_factory.mktemp("loaded")) as process:
+        yield process
 
 
 TINY_CAMERA = (24, 32)

@@ -7,19 +7,27 @@ import json
 import os
 import re
 import subprocess
-import sys
 import tomllib
 from pathlib import Path
 from typing import Any
 
 import pytest
+from loaded_process import LoadedProcess
 
 from lerobot_vtrefine.extras import EXTRA_OF
 
 ROOT = Path(__file__).parents[1]
+BLOCKED = ROOT / "tests" / "blocked" / "sitecustomize.py"
 SIMULATORS = ("mujoco", "warp", "mujoco_warp", "trimesh", "manifold3d")
 DEVICES = ("serial", "dynamixel_sdk", "deepdiff", "evdev", "pynput", "rerun", "foxglove")
 INSTALL = "pip install 'lerobot_policy_vtrefine[{}]'"
+
+# What every Python does at its start that this one starts.
+HIDE = f"""
+import runpy, sys
+blocked = runpy.run_path({str(BLOCKED)!r})["BLOCKED"]
+assert not set(blocked) & set(sys.modules)
+"""
 
 # Many commands in one process: importing LeRobot takes most of the time.
 RUN_COMMANDS = """
@@ -41,20 +49,18 @@ print(json.dumps(results))
 """
 
 
-def blocked(modules: tuple[str, ...]) -> dict[str, str]:
-    """The environment of processes in which these modules cannot be found."""
-    paths = [str(ROOT / "tests" / "blocked"), os.environ.get("PYTHONPATH", "")]
-    return os.environ | {
-        "BLOCKED_MODULES": ",".join(modules),
-        "PYTHONPATH": os.pathsep.join(filter(None, paths)),
-        "HF_HUB_OFFLINE": "1",
-    }
+def run_without(
+    loaded: LoadedProcess, modules: tuple[str, ...], code: str, *arguments: str
+) -> subprocess.CompletedProcess[str]:
+    """Run code where these modules cannot be found."""
+    paths = [str(BLOCKED.parent), os.environ.get("PYTHONPATH", "")]
+    hidden = {"BLOCKED_MODULES": ",".join(modules), "PYTHONPATH": os.pathsep.join(filter(None, paths))}
+    return loaded.run(HIDE + code, *arguments, cwd=ROOT, **hidden)
 
 
-def run_commands(modules: tuple[str, ...], commands: list[list[str]]) -> list[Any]:
+def run_commands(loaded: LoadedProcess, modules: tuple[str, ...], commands: list[list[str]]) -> list[Any]:
     """(status, text, lines on standard error) of each command, without these modules."""
-    command = [sys.executable, "-c", RUN_COMMANDS, json.dumps(commands)]
-    done = subprocess.run(command, capture_output=True, text=True, env=blocked(modules), check=False)
+    done = run_without(loaded, modules, RUN_COMMANDS, json.dumps(commands))
     assert done.returncode == 0, done.stderr[-2000:]
     return json.loads(done.stdout.strip().splitlines()[-1])
 
@@ -84,30 +90,17 @@ def test_every_package_of_an_extra_is_known_by_what_is_imported() -> None:
 
 
 @pytest.mark.timeout(900)
-def test_recording_training_and_rollout_need_no_simulator() -> None:
+def test_recording_training_and_rollout_need_no_simulator(loaded: LoadedProcess) -> None:
     test = "tests/robots/test_rollout.py::test_record_train_and_roll_out_on_the_same_robot"
-    command = [
-        sys.executable,
-        "-m",
-        "pytest",
-        "-q",
-        "-m",
-        "slow",
-        "-p",
-        "no:cacheprovider",
-        "-p",
-        "no:xdist",
-        test,
-    ]
-    done = subprocess.run(
-        command, cwd=ROOT, capture_output=True, text=True, env=blocked(SIMULATORS), check=False
-    )
+    arguments = ("-q", "-m", "slow", "-p", "no:cacheprovider", "-p", "no:xdist", test)
+    code = "import pytest; raise SystemExit(pytest.main())"
+    done = run_without(loaded, SIMULATORS, code, *arguments)
     assert done.returncode == 0, done.stdout[-3000:]
     assert "1 passed" in done.stdout
 
 
 @pytest.mark.timeout(900)
-def test_what_simulates_names_the_extra(tiny_dataset: Path, tmp_path: Path) -> None:
+def test_what_simulates_names_the_extra(loaded: LoadedProcess, tiny_dataset: Path, tmp_path: Path) -> None:
     checkpoint = str(tmp_path / "checkpoint")
     env, dataset = "--env.type=vtrefine", f"--dataset.root={tiny_dataset}"
     out = f"--output_dir={tmp_path / 'out'}"
@@ -122,7 +115,7 @@ def test_what_simulates_names_the_extra(tiny_dataset: Path, tmp_path: Path) -> N
         ["press", out],
         ["bench", "--parts=[tactile, envs]"],
     ]
-    for command, (status, _, lines) in zip(commands, run_commands(SIMULATORS, commands), strict=True):
+    for command, (status, _, lines) in zip(commands, run_commands(loaded, SIMULATORS, commands), strict=True):
         assert status in (1, 2), command
         assert "extra [sim]" in lines[-1], (command, lines[-3:])
         assert INSTALL.format("sim") in lines[-1], command
@@ -134,7 +127,7 @@ def test_what_simulates_names_the_extra(tiny_dataset: Path, tmp_path: Path) -> N
 
 
 @pytest.mark.timeout(900)
-def test_what_reads_ports_names_the_extra(tmp_path: Path) -> None:
+def test_what_reads_ports_names_the_extra(loaded: LoadedProcess, tmp_path: Path) -> None:
     data = [
         "--dataset.repo_id=local/x",
         f"--dataset.root={tmp_path / 'x'}",
@@ -159,7 +152,7 @@ def test_what_reads_ports_names_the_extra(tmp_path: Path) -> None:
         ],
         ["lerobot_teleoperate", *follower, *leader],
     ]
-    results = run_commands(DEVICES, [*helps, *commands])
+    results = run_commands(loaded, DEVICES, [*helps, *commands])
     for command, (status, text, _) in zip(helps, results, strict=False):
         assert (status, "usage:" in text) == (0, True), command
     for command, (status, _, lines) in zip(commands, results[len(helps) :], strict=True):

@@ -7,11 +7,10 @@ import sys
 from typing import Any
 
 import pytest
+from loaded_process import LoadedProcess
 
-# Each case runs in a child of one process that has loaded what makes LeRobot slow to import, but not LeRobot.
-FIRST_IMPORTS = """
-import json, os, sys
-import deepdiff, pandas, torch._dynamo, torchvision
+FIRST_IMPORT = """
+import json, sys
 
 def found(first):
     import importlib, importlib.util
@@ -36,17 +35,7 @@ def found(first):
     return types | {"steps": [name for name in ProcessorStepRegistry.list() if name.startswith("vt_")],
                     "version": lerobot.__version__}
 
-answers = []
-for first in json.loads(sys.argv[1]):
-    read, write = os.pipe()
-    if not os.fork():
-        os.write(write, json.dumps(found(first)).encode())
-        os._exit(0)
-    os.close(write)
-    with os.fdopen(read) as pipe:
-        answers.append(json.loads(pipe.read() or "null"))
-    os.wait()
-print(json.dumps(answers))
+print(json.dumps(found(sys.argv[1])))
 """
 
 CASES = (
@@ -107,11 +96,6 @@ def answer(code: str, *arguments: Any) -> Any:
     return json.loads(result.stdout.strip().splitlines()[-1])
 
 
-@pytest.fixture(scope="module")
-def answers() -> dict[str, Any]:
-    return dict(zip(CASES, answer(FIRST_IMPORTS, CASES), strict=True))
-
-
 def test_import_alone_loads_nothing() -> None:
     assert answer(LIGHT) == []
 
@@ -121,8 +105,9 @@ def test_help_of_short_commands_loads_neither_lerobot_nor_torch() -> None:
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_every_type_is_registered_whatever_is_imported_first(answers: dict[str, Any], case: str) -> None:
-    found = answers[case]
-    assert found is not None, "the import failed"
+def test_every_type_is_registered_whatever_is_imported_first(loaded: LoadedProcess, case: str) -> None:
+    done = loaded.run(FIRST_IMPORT, case)
+    assert done.returncode == 0, done.stderr[-2000:]
+    found = json.loads(done.stdout.strip().splitlines()[-1])
     assert found.pop("version")
     assert {key: set(values) for key, values in found.items()} == EXPECTED

@@ -9,6 +9,7 @@ examples:
 
 import importlib.util
 import json
+import os
 import subprocess
 import sys
 import tempfile
@@ -46,6 +47,9 @@ SIMULATED = ("tactile", "envs")
 
 SHORTENED: dict[str, dict[str, float]] = {"drivers": {"seconds": 2.0}}
 """Arguments of run() that keep a part within the limit; with --full it gets its own defaults."""
+
+ONE_THREAD = {"diagnose": {"OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}}
+"""Variables of parts that count processor time, to which threads that wait for one another would add."""
 
 CHILD = """
 import importlib, json, pathlib, sys
@@ -147,6 +151,7 @@ def measure_part(part: str, limit_s: float | None, arguments: dict[str, float]) 
                 stdin=subprocess.DEVNULL,
                 stdout=file,
                 stderr=subprocess.STDOUT,
+                env=os.environ | ONE_THREAD.get(part, {}),
             )
             try:
                 status = child.wait(limit_s)

@@ -68,6 +68,16 @@ def test_parts_are_shortened_unless_full(monkeypatch: pytest.MonkeyPatch, tmp_pa
     assert [row.ratio for row in bench.measure(["long"], 0.001, full=True)] == [9.0]
 
 
+@pytest.mark.usefixtures("fake_parts")
+def test_processor_time_is_that_of_one_thread(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    code = 'import os\ndef run(): return [("threads", os.environ["OMP_NUM_THREADS"], "")]'
+    (tmp_path / "counting_bench.py").write_text(code)
+    monkeypatch.setenv("OMP_NUM_THREADS", "2")
+    monkeypatch.setattr(bench, "PARTS", dict.fromkeys(("diagnose", "drivers"), "counting_bench"))
+    monkeypatch.setattr(bench, "SHORTENED", {})
+    assert [row.ratio for row in bench.measure(("diagnose", "drivers"), 60.0)] == [1.0, 2.0]
+
+
 @pytest.mark.parametrize(
     ("flags", "message"),
     [
@@ -96,6 +106,7 @@ def test_bad_values_are_one_line(
 def test_device_prints_a_row_per_number_of_worlds_and_compares_solvers(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    monkeypatch.setattr("lerobot_vtrefine.sim.benchmark.REPEATS", 1)
     flags = ["--device=cpu", "--worlds=[1]", "--steps=2", "--solver=[own, stock]"]
     monkeypatch.setattr(sys, "argv", ["vtrefine-bench", *flags])
     assert bench.main() == 0

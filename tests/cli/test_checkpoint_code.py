@@ -6,7 +6,11 @@ import sys
 from pathlib import Path
 
 import pytest
-from tiny_commands import TINY_ENV, lerobot
+from loaded_process import LoadedProcess
+from tiny_commands import TINY_ENV
+
+COMMAND = "import runpy, sys; sys.argv[:] = sys.argv[1:]; runpy.run_path(sys.argv[0], run_name='__main__')"
+"""A console script with its arguments."""
 
 
 def poisoned(checkpoint: Path, folder: Path, marker: Path) -> Path:
@@ -19,22 +23,21 @@ def poisoned(checkpoint: Path, folder: Path, marker: Path) -> Path:
     return folder
 
 
-def test_stock_eval_and_train_refuse_it(checkpoint: Path, demos: Path, tmp_path: Path) -> None:
+def test_stock_eval_and_train_refuse_it(
+    checkpoint: Path, demos: Path, tmp_path: Path, loaded: LoadedProcess
+) -> None:
     marker = tmp_path / "ran"
     policy = (f"--policy.path={poisoned(checkpoint, tmp_path / 'policy', marker)}", "--policy.device=cpu")
     data = ("--dataset.repo_id=local/vtrefine_demos", f"--dataset.root={demos}", "--num_workers=0")
     train = ("--steps=1", "--batch_size=4", "--wandb.enable=false", "--policy.push_to_hub=false")
     evaluate = ("--eval.n_episodes=1", "--eval.batch_size=1", "--env.episode_steps=5", *TINY_ENV)
-    cache = tmp_path / "hf"
-    started = [
-        lerobot("eval", *policy, *evaluate, f"--output_dir={tmp_path / 'eval'}", cache=cache),
-        lerobot("train", *policy, *data, *train, f"--output_dir={tmp_path / 'train'}", cache=cache),
-    ]
-    for process in started:
-        output, _ = process.communicate(timeout=240)
-        assert process.returncode != 0
-        assert "policy_preprocessor.json of" in output.splitlines()[-1], output[-3000:]
-        assert "names the class 'subprocess.Popen'" in output.splitlines()[-1]
+    for name, arguments in (("eval", evaluate), ("train", (*data, *train))):
+        program = str(Path(sys.executable).with_name(f"lerobot-{name}"))
+        done = loaded.run(COMMAND, program, *policy, *arguments, f"--output_dir={tmp_path / name}")
+        assert done.returncode == 1
+        told = done.stderr.splitlines()[-1]
+        assert "policy_preprocessor.json of" in told, done.stderr[-3000:]
+        assert "names the class 'subprocess.Popen'" in told
     assert not marker.exists()
 
 
