@@ -2,10 +2,12 @@
 
 import gc
 import importlib.metadata
+import inspect
 import os
 from collections.abc import Callable, Generator
 from functools import cache
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -48,13 +50,15 @@ def pytest_collection_finish() -> None:
 def _what_stays_is_looked_up_once() -> None:
     """Commands that many tests run in this process would each look it up again.
 
-    For every setting of every parser, draccus looks through the source of its class: half of a parse. For
-    plugins, LeRobot parses what every installed package says of itself. For every column that is named or
-    copied, datasets asks of all columns whether they hold pictures: most of what opening a dataset takes.
+    For every setting of every parser, draccus looks through the source of its class, half of a parse, and at
+    the signature of argparse's action, half of the rest. For plugins, LeRobot parses what every installed
+    package says of itself. For every column that is named or copied, datasets asks of all columns whether
+    they hold pictures: most of what opening a dataset takes.
     """
     from datasets.features import features
-    from draccus.wrappers import docstring
+    from draccus.wrappers import docstring, field_wrapper
 
+    field_wrapper.inspect = SimpleNamespace(getfullargspec=cache(inspect.getfullargspec))
     docstring.get_attribute_docstring = cache(docstring.get_attribute_docstring)
     said = importlib.metadata.Distribution.metadata.fget
     parsed = cache(lambda place: said(importlib.metadata.PathDistribution(place)))

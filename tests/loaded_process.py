@@ -1,7 +1,7 @@
 """Processes that have imported what takes LeRobot seconds to import, but neither LeRobot nor this package.
 
-This file as a program is the first of them; each line that it reads starts a copy of it, which runs some code as
-``python -c`` does.
+This file as a program is the first of them; each line that it reads starts a copy of it, which runs some code
+as ``python -c`` does.
 """
 
 import contextlib

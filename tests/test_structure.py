@@ -236,7 +236,7 @@ def test_library_does_not_print() -> None:
 
 
 def test_scripts_start_commands_that_end_with_them() -> None:
-    """``runs.side_by_side`` and ``own_sessions`` do; what subprocess starts goes on when a script is ended."""
+    """``runs.side_by_side`` and ``own_sessions`` see to it; what subprocess starts goes on without them."""
     starting = [
         f"{relative(path)}:{node.lineno}"
         for path in sorted((ROOT / "scripts").rglob("*.py"))

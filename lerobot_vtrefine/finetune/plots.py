@@ -19,7 +19,8 @@ def draw_curves(rows: list[dict[str, float]], path: Path) -> None:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(11, 6), layout="constrained")
+    figure = Figure(figsize=(11, 6))
+    figure.subplots_adjust(0.06, 0.09, 0.985, 0.94, 0.2, 0.42)  # "constrained" takes longer than all the rest
     FigureCanvasAgg(figure)
     for axes, (title, series) in zip(figure.subplots(2, 3).flat, PANELS, strict=True):
         for key, label in series.items():

@@ -1,14 +1,12 @@
 """Scripts: each in scripts/ is a command that tells how it is used, and pages name flags that it has."""
 
 import json
-import os
 import re
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 from command_uses import uses
+from loaded_process import LoadedProcess
 
 ROOT = Path(__file__).parents[2]
 SCRIPTS = ROOT / "scripts"
@@ -20,8 +18,9 @@ SCRIPT = r"(?:\./)?scripts/(\w+)\.py"
 # All in one process: importing what they need takes most of the time.
 ASK = """
 import contextlib, io, json, runpy, sys
+_, paths, *sys.path[:0] = sys.argv
 found = {}
-for path in json.loads(sys.argv[1]):
+for path in json.loads(paths):
     sys.argv = [path, "--help"]
     out = io.StringIO()
     with contextlib.redirect_stdout(out):
@@ -35,17 +34,10 @@ print(json.dumps(found))
 
 
 @pytest.fixture(scope="module")
-def helps() -> dict[str, str]:
+def helps(loaded: LoadedProcess) -> dict[str, str]:
     """What --help of every script prints."""
     paths = [str(path) for path in sorted(SCRIPTS.glob("*.py")) if path.stem not in RUN_BY_OTHERS]
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(SCRIPTS), str(ROOT)])}
-    done = subprocess.run(
-        [sys.executable, "-c", ASK, json.dumps(paths)],
-        env=environment,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    done = loaded.run(ASK, json.dumps(paths), *map(str, (SCRIPTS, ROOT)))
     assert done.returncode == 0, done.stderr[-2000:]
     found = json.loads(done.stdout.strip().splitlines()[-1])
     assert [path for path, (status, _) in found.items() if status != 0] == []
