@@ -4,11 +4,14 @@ This file as a program is the first of them; each line that it reads starts a co
 as ``python -c`` does.
 """
 
+import atexit
 import contextlib
+import gc
 import json
 import os
 import subprocess
 import sys
+import traceback
 from collections.abc import Generator
 from pathlib import Path
 
@@ -50,26 +53,38 @@ def loaded_process(folder: Path) -> Generator[LoadedProcess]:
 
 
 def main() -> None:
-    """Make copies until there are no more lines; returns in the copies, too."""
+    """Make copies until there are no more lines."""
     for module in IMPORTED:
         __import__(module)
+    gc.freeze()
     for line in sys.stdin:
         child = os.fork()
         if child == 0:
-            begin(json.loads(line))
-            return
+            status = obey(json.loads(line))
+            atexit._run_exitfuncs()
+            sys.stdout.flush()
+            os._exit(status)  # to take everything apart that was imported would take longer than most orders
         print(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]), flush=True)
 
 
-def begin(order: dict) -> None:
-    """In a copy: what the order says; an error or an exit ends the process as it ends any other."""
+def obey(order: dict) -> int:
+    """In a copy: run what the order says; the exit status, as Python has it."""
     for number, name in enumerate((os.devnull, *order["files"])):
         os.dup2(os.open(name, os.O_RDWR | os.O_CREAT | os.O_TRUNC), number)
     os.environ.update(order["environment"])
     os.chdir(order["cwd"])
     sys.path.insert(0, "")
     sys.argv[:] = ["-c", *order["arguments"]]
-    exec(order["code"], {"__name__": "__main__"})
+    try:
+        exec(order["code"], {"__name__": "__main__"})
+    except SystemExit as stop:
+        if isinstance(stop.code, str):
+            print(stop.code, file=sys.stderr)
+        return stop.code if isinstance(stop.code, int) else int(stop.code is not None)
+    except BaseException:
+        traceback.print_exc()
+        return 1
+    return 0
 
 
 if __name__ == "__main__":

@@ -43,6 +43,7 @@ def launch(command: str, module: str, config: str) -> int:
     try:
         main = importlib.import_module(name).main
     finally:
+        gc.freeze()  # and at the end, when all goes at once, a second or two
         gc.enable()
     from lerobot_vtrefine.lerobot_compat.config_errors import undecoded_values_raise
 

@@ -1,9 +1,11 @@
 """Starting commands: names of configuration files, the umbrella, flags read from the source."""
 
+import importlib
 import shlex
 import sys
 from dataclasses import fields
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -219,6 +221,14 @@ def test_settings_that_go_together_are_told_as_one_flag() -> None:
     flags = flags_of("lerobot_vtrefine.cli.pipeline.demo_config", "DemoConfig")
     with pytest.raises(ValueError, match=r"at once: give --env='\{scene: \{pair: key\}\}'$"):
         check_arguments(flags, ["--env.scene.pair=key"])
+
+
+def test_what_a_command_imports_is_not_looked_through_at_its_end(monkeypatch) -> None:
+    frozen: list[bool] = []
+    monkeypatch.setattr("gc.freeze", lambda: frozen.append(True))
+    monkeypatch.setattr(importlib, "import_module", lambda name: SimpleNamespace(main=lambda: len(frozen)))
+    monkeypatch.setattr("sys.argv", ["vtrefine-bench"])
+    assert launch.launch("bench", "lerobot_vtrefine.cli.bench", "BenchConfig") == 1
 
 
 def test_help_goes_as_deep_as_one_asks(monkeypatch, capsys) -> None:
