@@ -1,6 +1,5 @@
 """Starting commands: names of configuration files, the umbrella, flags read from the source."""
 
-import importlib
 import shlex
 import sys
 from dataclasses import fields
@@ -226,8 +225,9 @@ def test_settings_that_go_together_are_told_as_one_flag() -> None:
 def test_what_a_command_imports_is_not_looked_through_at_its_end(monkeypatch) -> None:
     frozen: list[bool] = []
     monkeypatch.setattr("gc.freeze", lambda: frozen.append(True))
-    monkeypatch.setattr(importlib, "import_module", lambda name: SimpleNamespace(main=lambda: len(frozen)))
     monkeypatch.setattr("sys.argv", ["vtrefine-bench"])
+    fake = SimpleNamespace(main=lambda: len(frozen))
+    monkeypatch.setitem(sys.modules, "lerobot_vtrefine.cli.bench", fake)
     assert launch.launch("bench", "lerobot_vtrefine.cli.bench", "BenchConfig") == 1
 
 
