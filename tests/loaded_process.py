@@ -40,7 +40,7 @@ class LoadedProcess:
 
 @contextlib.contextmanager
 def loaded_process(folder: Path) -> Generator[LoadedProcess]:
-    """Start it, offline and without a cache of its own; it ends with the block."""
+    """Start it, offline and with an empty cache; it ends with the block."""
     environment = {"HF_HUB_OFFLINE": "1", "HF_HOME": str(folder), "OMP_NUM_THREADS": "1"}
     with subprocess.Popen(
         [sys.executable, "-P", __file__],

@@ -49,6 +49,7 @@ found = {
     ],
 }
 print(json.dumps(found))
+import gc; gc.freeze()  # what was imported need not be looked through once more
 """
 
 HELP = """
