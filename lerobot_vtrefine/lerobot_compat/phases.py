@@ -5,6 +5,7 @@ parts back; a simulated one must know when to start anew, and can end an episode
 loops of ``lerobot-record`` and of the episodic strategy of ``lerobot-rollout``. Teleoperators that solve for
 joint positions themselves must know where the joints are when a loop begins, that of ``lerobot-teleoperate``
 included. A policy in ``lerobot-rollout`` without recording must forget what it planned for the last episode.
+A simulated robot must also know at which rate it is driven, by ``lerobot-replay`` as well.
 Robots without ``phase`` and teleoperators without ``follow`` see nothing of it.
 """
 
@@ -24,18 +25,22 @@ LOOPS = (
     ("lerobot.rollout.strategies.episodic", "EpisodicStrategy", "_reset_loop"),
 )
 """Module, class and name of each function that runs one phase of a recording."""
+REPLAY = "lerobot.scripts.lerobot_replay"
 
 
 @runtime_checkable
 class PhasedRobot(Protocol):
     """A robot that wants to know."""
 
-    def phase(self, events: dict[str, bool], fps: float, dataset: Any | None) -> AbstractContextManager[None]:
+    def check_rate(self, fps: float) -> None:
+        """Raises: ValueError where the robot cannot be driven at a loop's rate [Hz]."""
+        ...
+
+    def phase(self, events: dict[str, bool], dataset: Any | None) -> AbstractContextManager[None]:
         """Entered where a phase begins and left where it ends.
 
         Args:
             events: LeRobot's keys; setting ``exit_early`` ends the phase.
-            fps: the loop's rate [Hz].
             dataset: what the episode is recorded into; None between two episodes.
         """
         ...
@@ -79,21 +84,41 @@ def install() -> None:
             setattr(owner, name, (_forgetting if name == "run" else _phased)(loop))
 
 
+def watch_replay(robot: PhasedRobot) -> None:
+    """Let the robot that ``lerobot-replay`` has made check the rate of the dataset that this opens next."""
+    for module in _modules(REPLAY):
+        stock = getattr(module.LeRobotDataset, "unphased", module.LeRobotDataset)
+
+        def opened(*args: Any, stock: Any = stock, **settings: Any) -> Any:
+            dataset = stock(*args, **settings)
+            robot.check_rate(dataset.fps)
+            return dataset
+
+        opened.unphased = stock  # ty: ignore[missing-attribute]
+        module.LeRobotDataset = opened
+
+
 def uninstall() -> None:
     """Restore LeRobot's own loops."""
-    for owner, name in _loaded():
+    replays = [(module, "LeRobotDataset") for module in _modules(REPLAY)]
+    for owner, name in [*_loaded(), *replays]:
         loop = vars(owner)[name]
         setattr(owner, name, getattr(loop, "unphased", loop))
 
 
-def _loaded() -> Iterator[tuple[Any, str]]:
-    """Module or class, and name, of every loop whose module is loaded, also as the script that runs."""
+def _modules(name: str) -> list[Any]:
+    """A module that is loaded, also as the script that runs."""
     main = sys.modules["__main__"]
+    modules = [sys.modules[name]] if name in sys.modules else []
+    if getattr(getattr(main, "__spec__", None), "name", None) == name:
+        modules.append(main)
+    return modules
+
+
+def _loaded() -> Iterator[tuple[Any, str]]:
+    """Module or class, and name, of every loop whose module is loaded."""
     for module_name, class_name, name in LOOPS:
-        modules = [sys.modules[module_name]] if module_name in sys.modules else []
-        if getattr(getattr(main, "__spec__", None), "name", None) == module_name:
-            modules.append(main)
-        for module in modules:
+        for module in _modules(module_name):
             yield (module if class_name is None else getattr(module, class_name)), name
 
 
@@ -125,6 +150,9 @@ def _forgetting(run: Callable[..., None]) -> Callable[..., None]:
         if not isinstance(robot, HoldingRobot):
             return run(strategy, ctx)
 
+        if isinstance(robot, PhasedRobot):
+            robot.check_rate(ctx.runtime.cfg.fps * ctx.runtime.cfg.interpolation_multiplier)
+
         def forget() -> None:
             strategy._engine.reset()
             strategy._interpolator.reset()
@@ -146,9 +174,10 @@ def _phased(loop: Callable[..., None]) -> Callable[..., None]:
     def run(*args: Any, **settings: Any) -> None:
         robot = getattr(settings["robot"], "inner", settings["robot"])
         with ExitStack() as stack:
-            if isinstance(robot, PhasedRobot) and "events" in settings:
-                phase = robot.phase(settings["events"], settings["fps"], settings.get("dataset"))
-                stack.enter_context(phase)
+            if isinstance(robot, PhasedRobot):
+                robot.check_rate(settings["fps"])
+                if "events" in settings:
+                    stack.enter_context(robot.phase(settings["events"], settings.get("dataset")))
             if isinstance(teleop := settings.get("teleop"), FollowingTeleoperator):
                 stack.enter_context(_followed(robot, teleop, settings["fps"]))
             return loop(*args, **settings)

@@ -20,7 +20,7 @@ REGISTERING = (
 """Packages whose import registers their types."""
 INSTALLED = (
     "lerobot_vtrefine.lerobot_compat.fast_reader",
-    "lerobot_vtrefine.lerobot_compat.training_rate",
+    "lerobot_vtrefine.lerobot_compat.action_rates",
 )
 """What is for every policy: LeRobot's own train on this package's data and in its environment, too."""
 LOCAL = "local/"

@@ -112,8 +112,10 @@ SEAMS = (
             "lerobot.rollout.strategies.base.BaseStrategy.run",
             "lerobot.rollout.strategies.episodic.EpisodicStrategy._policy_loop",
             "lerobot.rollout.strategies.episodic.EpisodicStrategy._reset_loop",
+            "lerobot.scripts.lerobot_replay.LeRobotDataset",
         ),
-        "a robot is not told where an episode begins or ends, so a simulated one could not start anew",
+        "a robot is not told where an episode begins or ends, so a simulated one could not start anew, nor at"
+        " which rate it is driven",
         "simulated robots and vtrefine_ee, when they are made",
         "refuses to make them",
     ),
@@ -150,9 +152,13 @@ SEAMS = (
         "warns and records LeRobot's way",
     ),
     Seam(
-        "training_rate",
-        ("lerobot.scripts.lerobot_train.make_train_eval_datasets",),
-        "lerobot-train evaluates at any --env.fps, whatever the dataset's",
+        "action_rates",
+        (
+            "lerobot.scripts.lerobot_train.make_train_eval_datasets",
+            "lerobot.scripts.lerobot_rollout.build_rollout_context",
+        ),
+        "lerobot-train evaluates at any --env.fps and lerobot-rollout moves arms at any --fps, whatever the"
+        " dataset's",
         "LeRobot's commands, when they discover plugins",
         "leaves the check out",
     ),

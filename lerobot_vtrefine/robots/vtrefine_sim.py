@@ -67,6 +67,7 @@ class VtRefineSim(Robot):
         self.cameras = {CAMERA: None}  # LeRobot counts them, for its image writer
         extend_lerobot({pad: PadConfig("simulation") for pad in self.body.pad_names})
         phases.install()
+        phases.watch_replay(self)
         self._world: LiveWorld | None = None
         self._pace = Pace(1.0 / config.fps)
         self._cuts = CutCommands(self.body, "the joints' limits and rates")
@@ -194,20 +195,21 @@ class VtRefineSim(Robot):
 
     # --- episodes -----------------------------------------------------------------------------------
 
+    def check_rate(self, fps: float) -> None:
+        """Raises: ValueError where a command gives another number of actions a second than are simulated."""
+        if fps != self.config.fps:
+            raise ValueError(
+                f"--robot.fps={self.config.fps}, but this command gives {fps:g} actions a second, by its"
+                f" --fps or --dataset.fps or as it was recorded: give --robot.fps={fps:g} or change the other"
+            )
+
     @contextmanager
-    def phase(self, events: dict[str, bool], fps: float, dataset: Any | None) -> Generator[None]:
+    def phase(self, events: dict[str, bool], dataset: Any | None) -> Generator[None]:
         """LeRobot records an episode, or waits between two: see `lerobot_compat.phases`.
 
         Raises:
-            ValueError: LeRobot's loop runs at another rate than the simulation, or the dataset is of another
-                simulation.
+            ValueError: the dataset is of another simulation.
         """
-        if fps != self.config.fps:
-            raise ValueError(
-                f"the simulation takes {self.config.fps} steps a second, this command {fps:g}: "
-                f"give --robot.fps={fps:g}, or the command's own rate (--dataset.fps, --fps) as "
-                f"{self.config.fps}"
-            )
         if dataset is not None:
             self._note_outcome()  # LeRobot saves an episode after the wait that follows it
             check_same(Path(dataset.root), simulation_settings(self.env))

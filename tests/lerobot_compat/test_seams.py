@@ -153,10 +153,13 @@ def safe_recording_(folder: Path) -> None:
 
 
 @probe
-def training_rate_(_: Path) -> None:
-    from lerobot.scripts import lerobot_train
+def action_rates_(_: Path) -> None:
+    from lerobot.rollout import context
+    from lerobot.scripts import lerobot_rollout, lerobot_train
 
     assert "fps" not in inspect.getsource(lerobot_train)
+    assert "build_rollout_context(cfg" in inspect.getsource(lerobot_rollout)
+    assert not re.search(r"polic\S*fps", inspect.getsource(context))
 
 
 def small_dataset(folder: Path) -> LeRobotDataset:

@@ -11,6 +11,7 @@ import pytest
 from aloha_columns import TACTILE_KEYS
 from commands import dataset_flags, flags, leader_flags, run_command, train
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from lerobot.scripts import lerobot_replay
 from rig import Rig
 
 from lerobot_vtrefine.cli.record_demos import RecordDemosConfig, record
@@ -157,6 +158,33 @@ def test_another_rate_is_refused_in_one_line(
     command = [*robot_flags(), *leader_flags(rig), *dataset_flags(tmp_path / "d", 1, 1.0, 15)]
     with pytest.raises(ValueError, match=r"--robot.fps=15"):
         run_command(monkeypatch, "record", command)
+    with pytest.raises(ValueError, match=r"--robot.fps=60"):  # what lerobot-teleoperate does by default
+        run_command(monkeypatch, "teleoperate", [*robot_flags(), *leader_flags(rig), "--teleop_time_s=1"])
+
+
+def test_a_recording_of_another_rate_is_not_replayed_in_slow_motion(
+    demos: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    replayed = flags(dataset__repo_id="local/demos", dataset__root=demos, dataset__episode=0)
+    command = flags(robot__type="vtrefine_sim", robot__env=GRASPED, robot__fps=3 * FPS, play_sounds="false")
+    with pytest.raises(ValueError, match=f"^--robot.fps={3 * FPS}, .* give --robot.fps={FPS} "):
+        run_command(monkeypatch, "replay", [*command, *replayed])
+    phases.uninstall()
+    assert lerobot_replay.LeRobotDataset is LeRobotDataset
+
+
+def rollout_of(robot: object, fps: int = FPS, between: int = 1) -> SimpleNamespace:
+    """The context of a rollout, as far as strategies without recording read it."""
+    runtime = SimpleNamespace(cfg=SimpleNamespace(fps=fps, interpolation_multiplier=between))
+    return SimpleNamespace(hardware=SimpleNamespace(robot_wrapper=robot), runtime=runtime)
+
+
+@pytest.mark.parametrize(("fps", "between"), [(3 * FPS, 1), (FPS, 2)])
+def test_a_rollout_that_records_nothing_runs_at_the_rate_of_the_simulation(fps: int, between: int) -> None:
+    robot = connected(fps=FPS)
+    with pytest.raises(ValueError, match=f"give --robot.fps={fps * between} "):
+        phases._forgetting(lambda *_: pytest.fail("it ran"))(None, rollout_of(robot, fps, between))
+    robot.disconnect()
 
 
 def connected(**settings: object) -> VtRefineSim:
@@ -179,7 +207,7 @@ def test_a_rerecorded_episode_starts_from_the_same_seed_and_is_not_noted(tmp_pat
     events = {"exit_early": False, "rerecord_episode": False}
 
     def episode() -> int:
-        with robot.phase(events, FPS, dataset):
+        with robot.phase(events, dataset):
             robot.get_observation()
             robot.send_action(home)
             return robot.world.seed
@@ -187,7 +215,7 @@ def test_a_rerecorded_episode_starts_from_the_same_seed_and_is_not_noted(tmp_pat
     assert episode() == 5
     assert episode() == 5  # discarded: the dataset did not grow
     dataset.num_episodes = 1
-    with robot.phase(events, FPS, None):
+    with robot.phase(events, None):
         assert robot.world.seed == 6
     assert episode() == 6
     robot.disconnect()  # not saved either
@@ -203,7 +231,7 @@ def test_a_dataset_of_another_simulation_is_refused_before_anything_is_recorded(
     (tmp_path / "meta" / "recording.json").write_text(json.dumps(other))
     with (
         pytest.raises(ValueError, match=r"recording.json notes a recording in another simulation: choose"),
-        robot.phase({"exit_early": False}, FPS, dataset),
+        robot.phase({"exit_early": False}, dataset),
     ):
         pytest.fail("a frame could have been recorded")
     robot.disconnect()
@@ -221,7 +249,7 @@ def test_a_rollouts_policy_forgets_the_last_episode() -> None:
             robot.send_action(robot.held_targets())
 
     wrapper = SimpleNamespace(inner=robot)
-    phases._forgetting(run)(strategy, SimpleNamespace(hardware=SimpleNamespace(robot_wrapper=wrapper)))
+    phases._forgetting(run)(strategy, rollout_of(wrapper))
     assert forgotten == [6, 6]
     assert robot.on_restart is None
     robot.disconnect()

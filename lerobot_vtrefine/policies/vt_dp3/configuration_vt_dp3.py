@@ -273,12 +273,11 @@ class VtDp3Config(PreTrainedConfig):
         """No rewards."""
         return
 
-    def check_fps(self, fps: int) -> None:
-        """Raises: ValueError for an environment in which chunks would run at another speed than learned."""
+    def check_fps(self, fps: float, flag: str = "--env.fps") -> None:
+        """Raises: ValueError where ``flag`` would let chunks run at another speed than learned."""
         if self.fps is not None and fps != self.fps:
             raise ValueError(
-                f"--env.fps={fps}, but the policy learned {self.fps} actions a second: give"
-                f" --env.fps={self.fps}"
+                f"{flag}={fps:g}, but the policy learned {self.fps} actions a second: give {flag}={self.fps}"
             )
 
     def check_body(self, name: str, joints: int) -> None:
