@@ -69,6 +69,11 @@ class EpisodeFolder:
     """Pads that have raw and idle counts, and how many readings each has."""
     num_episodes: int
 
+    def check_rate(self, fps: int) -> None:
+        """Raises: ValueError for a simulation in which the commands would run at another speed."""
+        if round(self.fps) != fps:
+            raise ValueError(f"{self.root} has {self.fps:g} frames/s, the twin --env.fps={fps}; give the same")
+
     def read(self, episodes: Sequence[int] | None = None) -> list[RecordedEpisode]:
         """The given episodes, all by default, in the order of their index.
 

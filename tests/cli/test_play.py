@@ -52,6 +52,8 @@ def test_a_recorded_episode_plays_again(tmp_path: Path) -> None:
     (row,) = played(dataset=EpisodeSource(root, 0), env=None)
     assert (row["seed"], row["steps"], row["success"]) == (noted["seed"], noted["steps"], True)
     assert row["depth_m"] == noted["depth_m"]
+    with pytest.raises(ValueError, match=r"demos has 10 frames/s, the twin --env\.fps=20; give the same"):
+        played(dataset=EpisodeSource(root, 0), env=replace(ENV, fps=20))
 
 
 @pytest.mark.slow

@@ -145,10 +145,12 @@ def recorded_agent(
     """A dataset's episode, the simulation that it plays in, and its seed where the dataset notes it.
 
     Raises:
-        ValueError: no such episode, or a dataset of another robot.
+        ValueError: no such episode, or a dataset of another robot or of another rate than ``env``.
         FileNotFoundError: no dataset.
     """
     folder = open_episodes(root)
+    if env is not None:
+        folder.check_rate(env.fps)
     agent, ledger = RecordedAgent(folder, episode), read_ledger(folder)
     if ledger is None:
         return agent, env or VtRefineEnvConfig(fps=round(folder.fps)), None

@@ -224,10 +224,7 @@ def _replay_scenes(
 
     if parts == "grasp":
         config = replace(config, start="table")
-    if round(folder.fps) != config.fps:
-        raise ValueError(
-            f"{folder.root} has {folder.fps:g} frames/s, the twin --env.fps={config.fps}; give the same"
-        )
+    folder.check_rate(config.fps)
     sim = make_simulation(config, 1)
     seeds = recorded_seeds(ledger, folder) if ledger is not None and parts == "recorded" else {}
     pairs, skipped, frames = [], {}, []
