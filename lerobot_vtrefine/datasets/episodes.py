@@ -72,7 +72,9 @@ class EpisodeFolder:
     def check_rate(self, fps: int) -> None:
         """Raises: ValueError for a simulation in which the commands would run at another speed."""
         if round(self.fps) != fps:
-            raise ValueError(f"{self.root} has {self.fps:g} frames/s, the twin --env.fps={fps}; give the same")
+            raise ValueError(
+                f"{self.root} has {self.fps:g} frames/s, the twin --env.fps={fps}; give the same"
+            )
 
     def read(self, episodes: Sequence[int] | None = None) -> list[RecordedEpisode]:
         """The given episodes, all by default, in the order of their index.

@@ -91,7 +91,12 @@ def test_data_without_the_needed_columns_is_refused_in_one_line() -> None:
     with pytest.raises(ValueError, match="and 1 more; record with") as error:
         config.validate_features()
     assert "\n" not in str(error.value)
-    config.modalities = "visual"
+    config.input_features = policy_features(DEPTH_KEY)  # of a robot that has pads, and no depth camera
+    with pytest.raises(ValueError, match=r"camera named front .*policy.modalities=tactile needs none"):
+        config.validate_features()
+    config.modalities = "tactile"
+    config.validate_features()
+    config.input_features, config.modalities = policy_features(*TACTILE_KEYS), "visual"
     config.validate_features()
     config.input_features = {STATE_KEY: policy_features()[STATE_KEY]}
     with pytest.raises(ValueError, match=DEPTH_KEY):

@@ -13,6 +13,7 @@ from lerobot.optim.schedulers import CosineAnnealingWithWarmupSchedulerConfig
 from lerobot_vtrefine.choices import check_choice
 from lerobot_vtrefine.datasets.features import (
     ACTION_KEY,
+    CAMERA,
     LIMITS_KEY,
     STATE_KEY,
     TACTILE_PREFIX,
@@ -320,6 +321,11 @@ class VtDp3Config(PreTrainedConfig):
         body = embodiment_with_pads([key.removeprefix(TACTILE_PREFIX) for key in keys])
         if body is not None and body.name != self.observation.embodiment:
             return f"the data is of {body.name}: set --policy.observation.embodiment={body.name}"
+        if set(self.required_keys) - set(self.input_features or {}) <= set(VISUAL_KEYS):
+            return (
+                f"a robot records them by a depth camera named {CAMERA} (--robot.cameras,"
+                " --robot.camera_models); policy.modalities=tactile needs none"
+            )
         return "record with vtrefine-record-demos or a tactile robot, or choose other modalities"
 
     def _check_sizes(self) -> None:
