@@ -3,6 +3,8 @@
 import dataclasses
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 from robot_rigs import Rig, make_set
 
@@ -183,3 +185,15 @@ def test_a_delay_is_never_known_better_than_the_servos_tick(tmp_path) -> None:
 def test_an_interval_is_widened_on_both_sides_and_not_below_zero() -> None:
     assert widened((0.7, 1.3), 1.0, 0.4) == pytest.approx((0.5, 1.5))
     assert widened((0.001, 0.003), 0.002, 0.01)[0] == 0.0
+
+
+def test_a_shoulder_that_stands_still_is_asked_to_move(tmp_path) -> None:
+    folder = make_set(Rig(**{**SMALL, "joints": ("waist", "shoulder")}), tmp_path, 0)
+    for path in folder.glob("*.parquet"):
+        table = pq.read_table(path)
+        for name in ("command", "position"):
+            still = [[waist, 0.3] for waist, _ in table[name].to_pylist()]
+            table = table.set_column(table.schema.get_field_index(name), name, pa.array(still))
+        pq.write_table(table, path)
+    told = diagnose_robot(read_recording_set(folder), seed=0).verdict.not_tested["gravity_sag"]
+    assert told.startswith("no joint that moves here is loaded by gravity")

@@ -17,8 +17,8 @@ Array = np.ndarray
 
 METHOD = MethodError(0.012, 0.03)
 NOT_SHOWN = (
-    "no joint here is loaded by gravity as far as its name tells: name joints by what they move (shoulder, "
-    "elbow), and hold the arm in eight postures from hanging to stretched out"
+    "no joint that moves here is loaded by gravity as far as its name tells: hold the arm in eight postures "
+    "from hanging to stretched out, and name joints by what they move (shoulder, elbow)"
 )
 _LEAD = {gravity.TWO_TERM_FORM: FORM_LEAD, gravity.FREE_FORM: 0.05}
 """By how much shapes with more terms must beat those with one."""
