@@ -9,7 +9,7 @@ from draccus.utils import DraccusException
 from lerobot.envs.configs import EnvConfig
 from lerobot.robots.config import RobotConfig
 
-from lerobot_vtrefine.choices import check_choice
+from lerobot_vtrefine.choices import check_choice, check_port
 from lerobot_vtrefine.envs.config import VtRefineEnvConfig
 from lerobot_vtrefine.files import read_yaml
 from lerobot_vtrefine.lerobot_compat.config_errors import told_by_lerobot
@@ -54,6 +54,7 @@ class VtRefineSimConfig(RobotConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         check_choice("--robot.view", self.view, VIEWS)
+        check_port("--robot.view_port", self.view_port)
         if self.seed < 0:
             raise ValueError(f"--robot.seed must not be negative, got {self.seed}")
         check_control_rate("--robot.fps", self.fps)

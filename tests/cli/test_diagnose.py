@@ -1,6 +1,8 @@
 """vtrefine-diagnose: files, exit statuses and messages; the engines have tests of their own."""
 
 import json
+import os
+import subprocess
 import sys
 from pathlib import Path
 
@@ -54,6 +56,19 @@ def test_writes_all_results_and_says_where(tmp_path, engine, capsys):
     printed = capsys.readouterr().out
     assert printed.startswith("explained: The simulation lacks taxel gain spread and hysteresis.")
     assert "report.html" in printed
+
+
+@pytest.mark.parametrize("given", [None, "3"])
+def test_blas_has_one_thread_unless_it_is_told_otherwise(tmp_path, engine, monkeypatch, given):
+    """The diagnosis has threads of its own. NumPy's BLAS looks only once, when it is loaded."""
+    name = "OPENBLAS_NUM_THREADS"
+    monkeypatch.setenv(name, given or "")
+    if given is None:
+        monkeypatch.delenv(name)
+    run(write_set(tmp_path / "set", *make_set()), tmp_path / "out")
+    assert os.environ[name] == (given or "1")
+    loaded = "import sys, lerobot_vtrefine.cli.diagnose; sys.exit('numpy' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", loaded], check=False).returncode == 0
 
 
 def test_the_engine_gets_sound_trials_and_the_verdict_lists_the_others(tmp_path, engine):

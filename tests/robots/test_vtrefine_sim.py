@@ -360,6 +360,7 @@ def test_wrong_settings_are_one_line(tmp_path: Path) -> None:
         ({"env_file": tmp_path / "none.yaml"}, "has no part `env:`"),
         ({"env": {"unheard": 1}}, "unheard"),
         ({"view": "window"}, "--robot.view=window"),
+        ({"view_port": 70_000}, "--robot.view_port must lie between 1 and 65535, got 70000"),
         ({"fps": 120}, "--robot.fps must lie between 1 and 100 control steps a second, got 120"),
     ):
         with pytest.raises(Exception, match=words):
