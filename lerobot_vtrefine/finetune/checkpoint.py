@@ -31,7 +31,7 @@ from lerobot_vtrefine.lerobot_compat.claim import Claim
 from lerobot_vtrefine.wording import plural
 
 STATE_NAME = "dppo_state.safetensors"
-PARTS = ("critic", "actor_optimizer", "critic_optimizer", "reward_scaler", "trust_region")
+PARTS = ("critic", "actor_optimizer", "critic_optimizer", "reward_scaler", "trust_region", "undo")
 """Of `TrainState`: what has a ``state_dict``."""
 
 
@@ -133,6 +133,7 @@ def load_training_state(checkpoint: Path, state: TrainState) -> None:
         raise ValueError(
             f"{checkpoint} was written by {plural(len(saved['ranks']), 'process')}: resume with as many"
         )
+    saved.setdefault("undo", {})  # not in checkpoints of earlier versions
     for part in PARTS:
         getattr(state, part).load_state_dict(saved[part])
     state.iteration, state.env_steps = saved["iteration"], saved["env_steps"]

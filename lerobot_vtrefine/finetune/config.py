@@ -21,7 +21,7 @@ POSITIVE = (
 NOT_NEGATIVE = (
     *("decisions", "minibatches", "micro_batch_decisions", "critic_warmup", "lr_warmup"),
     *("actor_lr_final", "actor_lr_max", "critic_lr_final", "weight_decay", "max_grad_norm"),
-    *("min_sampling_std", "kl_coef", "bc_coef", "value_coef", "target_kl"),
+    *("min_sampling_std", "kl_coef", "bc_coef", "value_coef", "target_kl", "undo_falls"),
 )
 """Settings that may be 0, and not less."""
 
@@ -86,6 +86,10 @@ class DppoConfig(draccus.ChoiceRegistry):
     kl_per_decision: float = 0.0
     # What kl_per_decision falls to by the last iteration.
     kl_per_decision_final: float = 0.0
+    # Go back to the policy that succeeded most often so far, and take steps half as large from there, where
+    # an iteration's episodes succeed less often by this many standard errors of the difference. The last
+    # iteration then only judges the update before it. 0: never.
+    undo_falls: float = 0.0
     # Penalty on half the squared shift of mean actions from the frozen base network's, in standard
     # deviations, per action element and tuned step: the KL divergence where noise_correlation is 0.
     kl_coef: float = 0.0

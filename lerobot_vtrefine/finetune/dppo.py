@@ -3,8 +3,7 @@
 Two nested decision processes: each decision t of the environment is a chain of denoising steps, of which
 the last K' (the tuned ones) form a Gaussian policy. Every tuned step of a decision shares the decision's
 advantage. What runs here, in order: ``collect`` episodes with the noisy sampler, values and advantages over
-decisions, ``update`` with PPO's clipped objective on (decision, tuned step) rows. Evaluation, with the
-deployment sampler, lies in ``evaluation.py``.
+decisions, ``update`` with PPO's clipped objective on (decision, tuned step) rows.
 
 Differences from the reference implementation, all deliberate: K'=1 works; critic-only iterations really
 happen; values of final states are never mixed with those of the next episode; the observation is encoded
@@ -52,6 +51,7 @@ from lerobot_vtrefine.finetune.protocols import (
 )
 from lerobot_vtrefine.finetune.seeds import TRAINING_SEEDS
 from lerobot_vtrefine.finetune.trust_region import TrustRegion
+from lerobot_vtrefine.finetune.undo import Undo
 from lerobot_vtrefine.policies.vt_dp3.diffusion import denoise_prefix, predictor
 
 Metrics = dict[str, float]
@@ -68,6 +68,7 @@ class TrainState:
     reward_scaler: RewardScaler
     generator: torch.Generator
     trust_region: TrustRegion
+    undo: Undo
     iteration: int = 0
     env_steps: int = 0
     """Of practice, in whole chunks: also what is left of one when its episode has ended."""
@@ -87,6 +88,7 @@ class TrainState:
             RewardScaler(),
             policy_noise(device, seed, rank_index()),
             TrustRegion(cfg),
+            Undo(cfg),
         )
 
 
@@ -215,7 +217,7 @@ class Minibatches:
         self.rollout, self.agent, self.state, self.cfg = rollout, agent, state, cfg
         self.advantages, self.targets = decision_advantages(rollout, state, cfg)
         self.privileged = rollout.privileged[rollout.step, rollout.env]
-        self.train_actor = state.iteration >= cfg.critic_warmup
+        self.train_actor = state.iteration >= cfg.critic_warmup and not state.undo.holds(state.iteration)
         self.regulariser = Regulariser()
         if self.train_actor:
             self.regulariser = Regulariser.of(rollout.obs, rollout.latents, agent, cfg, state.generator)
@@ -333,12 +335,10 @@ def update(rollout: Rollout, agent: Agent, state: TrainState, cfg: DppoConfig) -
     if data.train_actor:
         last_epoch = [found["decision_kl"] for found in history[-data.per_epoch :]]
         region.adapt(last_epoch, stopped, state.iteration)
-    averages = {
-        name: sum(found[name] for found in history) / max(len(history), 1) for name in MINIBATCH_METRICS
-    }
+    taken = max(len(history), 1)
+    averages = {name: sum(found[name] for found in history) / taken for name in MINIBATCH_METRICS}
     del averages["log_ratio"]
-    has_moved = data.train_actor and history
-    grad_norm = float(torch.stack(grad_norms).double().mean()) if has_moved else 0.0
+    grad_norm = float(torch.stack(grad_norms).double().mean()) if data.train_actor and history else 0.0
     told = {
         "grad_norm": grad_norm,
         "initial_log_ratio": initial_log_ratio,
@@ -381,13 +381,16 @@ def train(
                 " contacts found no room; else shorten --env.scene.timestep_s"
             )
         state.critic.update_moments(rollout.privileged[:-1][rollout.active])
-        metrics = rollout_metrics(rollout)
-        metrics |= update(rollout, agent, state, cfg)
+        trained = agent.trained_parameters(), state.actor_optimizer
+        if undone := state.undo.judge(rollout.success, rollout.active[0], *trained):
+            state.trust_region.shrink()
+        metrics = rollout_metrics(rollout) | update(rollout, agent, state, cfg)
         give_back_unused(agent.device)
         state.iteration += 1
         state.env_steps += int(decisions) * chunk
         seconds = time.perf_counter() - started
         metrics |= {
+            "undone": float(undone),
             "env_steps": float(state.env_steps),
             "steps_per_s": decisions * chunk / seconds,
             "seconds": seconds,
