@@ -305,6 +305,8 @@ class Recorder:
         self.log.add(iteration, metrics)
         shown = ", ".join(f"{key} {metrics[key]:.3g}" for key in SHOWN if key in metrics)
         logging.info("iteration %d: %s", iteration, shown)
+        if metrics.get("undone"):
+            logging.info("success fell: back to the best policy so far, in steps half as large")
 
 
 def save_config(cfg: FinetunePipelineConfig, policy: VtDp3Config) -> None:
