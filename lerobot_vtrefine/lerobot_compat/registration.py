@@ -25,7 +25,9 @@ INSTALLED = (
 """What is for every policy: LeRobot's own train on this package's data and in its environment, too."""
 LOCAL = "local/"
 """Names of datasets that are on no Hub."""
-READ_DATASETS = ("lerobot-train", "lerobot-replay")
+NEEDED = {"lerobot-train": "data", "lerobot-replay": "data", "lerobot-record": "meta"}
+"""By command that reads a dataset, the last one with ``--resume=true`` alone, the folder it must have."""
+YES = ("true", "yes", "y", "on", "1")
 
 
 def register() -> None:
@@ -40,10 +42,18 @@ def refuse_missing_dataset() -> None:
     """Name the folder where LeRobot would ask the Hub for a dataset of this machine, as after a typo.
 
     Raises:
-        SystemExit: the command line names a local dataset, in a folder without episodes.
+        SystemExit: the command line names a local dataset, and its folder holds none. Where a file of
+            settings is named, too, the folder must be named beside it, as the file may do so.
     """
-    given = dict(argument.partition("=")[::2] for argument in sys.argv[1:])
+    command, given = Path(sys.argv[0]).name, dict(text.partition("=")[::2] for text in sys.argv[1:])
     root, name = given.get("--dataset.root"), given.get("--dataset.repo_id", "")
-    reads = Path(sys.argv[0]).name in READ_DATASETS and name.startswith(LOCAL)
-    if reads and root and not (Path(root) / "data").is_dir():
-        raise SystemExit(f"error: --dataset.root={root} holds no recorded episodes (there is no {root}/data)")
+    told = root or "--config_path" not in given
+    reads = command != "lerobot-record" or given.get("--resume", "").lower() in YES
+    if not (name.startswith(LOCAL) and command in NEEDED and reads and told):
+        return
+    from lerobot.utils.constants import HF_LEROBOT_HOME
+
+    folder = Path(root or HF_LEROBOT_HOME / name) / NEEDED[command]
+    if not folder.is_dir():
+        where = f"--dataset.root={root}" if root else f"{folder.parent} (no --dataset.root was given)"
+        raise SystemExit(f"error: {where} holds no recorded episodes: there is no {folder}")

@@ -299,18 +299,31 @@ def test_the_umbrella_runs_a_command_as_if_called_by_its_name(monkeypatch, capsy
 
 def test_a_local_dataset_that_is_not_there_is_named(monkeypatch, tmp_path: Path) -> None:
     """LeRobot asks the Hub for it, and ends in a hundred lines about the network."""
+    root, home = tmp_path / "demos", tmp_path / "home"
+    monkeypatch.setattr("lerobot.utils.constants.HF_LEROBOT_HOME", home)
 
-    def trains_on(root: Path, name: str, command: str = "lerobot-train") -> None:
-        line = [f"/bin/{command}", f"--dataset.root={root}", f"--dataset.repo_id={name}"]
-        monkeypatch.setattr(sys, "argv", line)
+    def run(command: str, *flags: str, name: str = "local/demos") -> None:
+        monkeypatch.setattr(sys, "argv", [f"/bin/{command}", f"--dataset.repo_id={name}", *flags])
         refuse_missing_dataset()
 
-    with pytest.raises(SystemExit, match=f"error: --dataset.root={tmp_path} holds no recorded episodes"):
-        trains_on(tmp_path, "local/demos")
-    trains_on(tmp_path, "USER/demos")  # downloaded to this folder
-    trains_on(tmp_path, "local/demos", "lerobot-record")
-    (tmp_path / "data").mkdir()
-    trains_on(tmp_path, "local/demos")
+    at_root = f"--dataset.root={root}"
+    with pytest.raises(SystemExit, match=f"error: {at_root} holds no recorded episodes: there is no {root}"):
+        run("lerobot-train", at_root)
+    with pytest.raises(SystemExit, match=f"error: {home}/local/demos .no --dataset.root was given. holds no"):
+        run("lerobot-replay")
+    for yes in ("true", "True", "1"):
+        with pytest.raises(SystemExit, match=f"there is no {root}/meta"):
+            run("lerobot-record", at_root, f"--resume={yes}")
+    run("lerobot-record", at_root)
+    run("lerobot-record", at_root, "--resume=false")
+    run("lerobot-train", at_root, name="USER/demos")  # downloaded to this folder
+    run("lerobot-train", "--config_path=settings.yaml")  # which may name the folder
+    (root / "data").mkdir(parents=True)
+    (root / "meta").mkdir()
+    (home / "local" / "demos" / "data").mkdir(parents=True)
+    run("lerobot-train", at_root)
+    run("lerobot-replay")
+    run("lerobot-record", at_root, "--resume=true")
 
 
 def test_stock_commands_get_the_path_when_they_discover_the_plugin(monkeypatch) -> None:
