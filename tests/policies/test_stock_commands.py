@@ -94,6 +94,25 @@ def test_training_writes_a_checkpoint_that_loads(trained: Path) -> None:
     assert average_steps(trained / "checkpoints" / "000010") == 10
 
 
+def test_a_checkpoint_is_judged(trained: Path, tmp_path: Path) -> None:
+    """``lerobot-eval`` as users start it: a process that finds the package by itself."""
+    command(
+        "lerobot-eval",
+        f"--policy.path={trained / 'checkpoints' / '000010' / 'pretrained_model'}",
+        "--env.type=vtrefine",
+        "--env.start=grasped",
+        "--env.episode_steps=8",
+        "--env.num_threads=1",
+        f"--env.metrics_path={tmp_path / 'episodes.jsonl'}",
+        "--env.video_episodes=0",
+        "--eval.n_episodes=2",
+        "--eval.batch_size=2",
+        f"--output_dir={tmp_path}",
+    )
+    assert len((tmp_path / "episodes.jsonl").read_text().splitlines()) == 2
+    assert json.loads((tmp_path / "eval_info.json").read_text())["overall"]["pc_success"] == 0.0
+
+
 def test_training_resumes_where_it_stopped(
     trained: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
