@@ -80,7 +80,7 @@ def test_balancing_improves_to_the_ceiling():
     torch.set_num_threads(1)
     torch.manual_seed(0)
     cfg = SmallDppo(
-        iterations=40,
+        iterations=60,
         num_envs=40,
         decisions=60,
         sampler="ddpm",
