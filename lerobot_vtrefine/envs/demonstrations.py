@@ -33,7 +33,7 @@ def expert_episodes(
     degradation: Degradation,
     num_envs: int,
     seeds: Iterable[int],
-    with_truth: bool,
+    with_truth: bool = False,
 ) -> Iterator[Demonstration]:
     """Expert episodes of ``seeds``, in their order; each is a pure function of its seed.
 
