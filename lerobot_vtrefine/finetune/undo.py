@@ -67,7 +67,8 @@ class Undo:
     def holds(self, iteration: int) -> bool:
         """Whether this iteration leaves the policy as it is: its episodes were another one's, or there is no
         iteration after it to judge an update."""
-        return self.again or (self._cfg.undo_falls > 0 and iteration >= self._cfg.iterations - 1)
+        last = iteration >= self._cfg.iterations - 1
+        return self._cfg.undo_falls > 0 and (self.again or last)
 
     def state_dict(self) -> dict[str, Any]:
         """What is kept."""

@@ -113,6 +113,11 @@ def test_what_is_kept_goes_through_a_checkpoint(tmp_path):
     walk.undo.load_state_dict(load_state(tmp_path / "state.safetensors"))
     assert walk.judge(400)
     assert walk.weight.item() == best
+    without = Undo(
+        replace(CFG, undo_falls=0.0)
+    )  # a run may be resumed without it, also where it just went back
+    without.load_state_dict(walk.undo.state_dict())
+    assert not without.holds(0)
 
 
 def test_a_run_ends_with_the_best_policy_where_the_last_update_is_bad(monkeypatch):
