@@ -85,25 +85,44 @@ def install() -> None:
 
 
 def watch_replay(robot: PhasedRobot) -> None:
-    """Let the robot that ``lerobot-replay`` has made check the rate of the dataset that this opens next."""
-    for module in _modules(REPLAY):
-        stock = getattr(module.LeRobotDataset, "unphased", module.LeRobotDataset)
+    """Let the robot that ``lerobot-replay`` makes now check the rate of the dataset that this opens next.
 
-        def opened(*args: Any, stock: Any = stock, **settings: Any) -> Any:
-            dataset = stock(*args, **settings)
+    Once: another robot that is replayed later in this process is none of this one's business.
+    """
+    for module in _modules(REPLAY):
+        _unwatch(module)
+        make, open_ = module.make_robot_from_config, module.LeRobotDataset
+
+        def made(*args: Any, module: Any = module, make: Any = make) -> Any:
+            _unwatch(module)
+            return make(*args)
+
+        def opened(*args: Any, module: Any = module, open_: Any = open_, **settings: Any) -> Any:
+            _unwatch(module)
+            dataset = open_(*args, **settings)
             robot.check_rate(dataset.fps)
             return dataset
 
-        opened.unphased = stock  # ty: ignore[missing-attribute]
-        module.LeRobotDataset = opened
+        made.unphased, opened.unphased = make, open_  # ty: ignore[missing-attribute]
+        module.make_robot_from_config, module.LeRobotDataset = made, opened
+
+
+def _unwatch(module: Any) -> None:
+    for name in ("make_robot_from_config", "LeRobotDataset"):
+        _restore(module, name)
 
 
 def uninstall() -> None:
     """Restore LeRobot's own loops."""
-    replays = [(module, "LeRobotDataset") for module in _modules(REPLAY)]
-    for owner, name in [*_loaded(), *replays]:
-        loop = vars(owner)[name]
-        setattr(owner, name, getattr(loop, "unphased", loop))
+    for owner, name in _loaded():
+        _restore(owner, name)
+    for module in _modules(REPLAY):
+        _unwatch(module)
+
+
+def _restore(owner: Any, name: str) -> None:
+    loop = vars(owner)[name]
+    setattr(owner, name, getattr(loop, "unphased", loop))
 
 
 def _modules(name: str) -> list[Any]:

@@ -11,8 +11,9 @@ import pytest
 from aloha_columns import TACTILE_KEYS
 from commands import dataset_flags, flags, leader_flags, run_command, train
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from lerobot.robots import make_robot_from_config
 from lerobot.scripts import lerobot_replay
-from rig import Rig
+from rig import Rig, follower_config
 
 from lerobot_vtrefine.cli.record_demos import RecordDemosConfig, record
 from lerobot_vtrefine.datasets.features import ACTION_KEY, DEPTH_KEY, STATE_KEY
@@ -169,8 +170,15 @@ def test_a_recording_of_another_rate_is_not_replayed_in_slow_motion(
     command = flags(robot__type="vtrefine_sim", robot__env=GRASPED, robot__fps=3 * FPS, play_sounds="false")
     with pytest.raises(ValueError, match=f"^--robot.fps={3 * FPS}, .* give --robot.fps={FPS} "):
         run_command(monkeypatch, "replay", [*command, *replayed])
-    phases.uninstall()
+
+
+def test_another_robot_that_is_replayed_later_in_this_process_has_its_own_rate(rig: Rig) -> None:
+    sim = VtRefineSim(VtRefineSimConfig(env={"start": "grasped", "num_threads": 1}))
+    assert lerobot_replay.LeRobotDataset is not LeRobotDataset  # sim would check the rate
+    other = lerobot_replay.make_robot_from_config(follower_config(rig))
+    assert other is not sim
     assert lerobot_replay.LeRobotDataset is LeRobotDataset
+    assert lerobot_replay.make_robot_from_config is make_robot_from_config
 
 
 def rollout_of(robot: object, fps: int = FPS, between: int = 1) -> SimpleNamespace:
