@@ -14,6 +14,8 @@ import numpy as np
 import pytest
 from loaded_process import LoadedProcess, loaded_process
 
+from lerobot_vtrefine.lerobot_compat.codec_priority import ordinary_priority
+
 LONGEST = (
     "policies/test_stock_commands.py",
     "test_extras.py",
@@ -85,13 +87,20 @@ def _nothing_waits_for_the_disk() -> None:
     os.fsync = fsync
 
 
-@pytest.fixture(autouse=True)
-def _ordinary_priority() -> Generator[None]:
-    """LeRobot's own commands do not give it back, and other workers, with emulated hardware, would starve."""
-    from lerobot_vtrefine.lerobot_compat.codec_priority import ordinary_priority
+@pytest.hookimpl(wrapper=True)
+def pytest_fixture_setup() -> Generator[None, Any, Any]:
+    """LeRobot's own commands do not give it back, and other workers, with emulated hardware, would starve.
 
+    Of fixtures and tests singly: a fixture of a whole file would raise it for all of them.
+    """
     with ordinary_priority():
-        yield
+        return (yield)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_pyfunc_call() -> Generator[None, Any, Any]:
+    with ordinary_priority():
+        return (yield)
 
 
 @pytest.fixture(scope="session")

@@ -21,6 +21,13 @@ def encode(path) -> None:
         container.mux(stream.encode())
 
 
+@pytest.fixture(scope="module")
+def encoded(tmp_path_factory: pytest.TempPathFactory) -> int:
+    """The scheduling policy after a fixture of the whole file has encoded a video."""
+    encode(str(tmp_path_factory.mktemp("encoded") / "video.mp4"))
+    return os.sched_getscheduler(0)
+
+
 @pytest.mark.skipif(not hasattr(os, "sched_getscheduler"), reason="no scheduling policies here")
 def test_the_codec_leaves_no_priority_behind(tmp_path) -> None:
     before = os.sched_getscheduler(0)
@@ -30,3 +37,10 @@ def test_the_codec_leaves_no_priority_behind(tmp_path) -> None:
     assert os.sched_getscheduler(0) == before
     if os.geteuid() == 0:  # else there is nothing to give back, and this test shows nothing
         assert raised != before
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_getscheduler"), reason="no scheduling policies here")
+def test_no_fixture_leaves_it_to_the_tests_after_it(encoded: int) -> None:
+    if os.geteuid() == 0:
+        assert encoded != os.SCHED_OTHER
+    assert os.sched_getscheduler(0) == os.SCHED_OTHER
