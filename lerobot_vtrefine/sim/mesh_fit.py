@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-_OVERLAP_M = 3e-4  # overlap that counts as blocked: above the error of the convex pieces
+OVERLAP_M = 3e-4
+"""Overlap that counts as blocked: above the error of the convex pieces."""
 _LATERAL_M = 0.012  # a plug that can move this far sideways is out of its socket
 _STEP_M = 0.002
 _MAX_TRAVEL_M = 0.2
@@ -22,19 +23,14 @@ _DIRECTIONS = 8
 
 @dataclass(frozen=True)
 class MeshFit:
-    """Geometry of the assembly; lengths in metres.
+    """Geometry of the assembly.
 
     `travel_m`: retreat along the exit axis after which the plug is free sideways, i.e. the depth of a seated
-    plug. `play_m`: free lateral travel per side at the assembled pose. `slack_m`: how far the plug can be
-    pushed beyond the assembled pose before it meets a stop (the search ends at `travel_m` where there is
-    none: `has_stop` is 0).
+    plug [m].
     `exit_sign`: +1 when the plug leaves along +z of the files' frame, -1 along -z.
     """
 
     travel_m: float
-    play_m: float
-    slack_m: float
-    has_stop: float
     exit_sign: float
 
     def arrays(self) -> dict[str, NDArray[Any]]:
@@ -43,14 +39,14 @@ class MeshFit:
 
     @classmethod
     def from_arrays(cls, arrays: dict[str, NDArray[Any]]) -> "MeshFit":
-        """Inverse of `arrays`."""
-        return cls(**{name: float(value) for name, value in arrays.items()})
+        """Inverse of `arrays`; entries of earlier versions hold more."""
+        return cls(float(arrays["travel_m"]), float(arrays["exit_sign"]))
 
 
 def measure_fit(plug: list[Array], socket: list[Array]) -> MeshFit:
     """Measure the fit of convex pieces [(V, 3) m, assembled at the identity]; ValueError if they cannot."""
-    probe = _OverlapProbe(plug, socket)
-    if probe.overlap(np.zeros(3)) > 2 * _OVERLAP_M + 2e-4:
+    probe = OverlapProbe(plug, socket)
+    if probe.overlap(np.zeros(3)) > 2 * OVERLAP_M + 2e-4:
         raise ValueError(
             "the two meshes overlap in the assembled pose, as which the files are read; check their common"
             " frame and --env.scene.mesh_scale"
@@ -61,38 +57,23 @@ def measure_fit(plug: list[Array], socket: list[Array]) -> MeshFit:
         raise ValueError(
             "the plug cannot leave its socket along z; the meshes' common frame needs z as insertion axis"
         )
-    down = np.array([0.0, 0.0, -sign])
-    slack = _first_blocked(probe, np.zeros(3), down, travel)
-    angles = 2 * np.pi * np.arange(_DIRECTIONS) / _DIRECTIONS
-    rays = np.stack([np.cos(angles), np.sin(angles), np.zeros(_DIRECTIONS)], axis=1)
-    play = min(_first_blocked(probe, np.zeros(3), ray, _LATERAL_M, 2e-4) for ray in rays)
-    return MeshFit(travel, play, slack, float(slack < travel - 1e-9), sign)
+    return MeshFit(travel, sign)
 
 
-def _free_travel(probe: "_OverlapProbe", sign: float) -> float:
+def _free_travel(probe: "OverlapProbe", sign: float) -> float:
     """Return the retreat along sign*z until every sideways move is free; inf when the way out is blocked."""
     angles = 2 * np.pi * np.arange(_DIRECTIONS) / _DIRECTIONS
     for height in np.arange(0.0, _MAX_TRAVEL_M, _STEP_M):
         offset = np.array([0.0, 0.0, sign * height])
-        if height > 0 and probe.overlap(offset) > 2 * _OVERLAP_M:
+        if height > 0 and probe.overlap(offset) > 2 * OVERLAP_M:
             return float("inf")
         reach = (_LATERAL_M * np.array([np.cos(angle), np.sin(angle), 0.0]) for angle in angles)
-        if all(probe.overlap(offset + side) <= _OVERLAP_M for side in reach):
+        if all(probe.overlap(offset + side) <= OVERLAP_M for side in reach):
             return float(height)
     return float("inf")
 
 
-def _first_blocked(
-    probe: "_OverlapProbe", origin: Array, direction: Array, limit_m: float, step_m: float = 5e-4
-) -> float:
-    """Return the free length along `direction` from `origin`, at most `limit_m`."""
-    for distance in np.arange(0.0, limit_m, step_m):
-        if probe.overlap(origin + distance * direction) > _OVERLAP_M:
-            return max(0.0, float(distance) - step_m)
-    return limit_m
-
-
-class _OverlapProbe:
+class OverlapProbe:
     """Deepest overlap of the plug's pieces with the socket's for a displaced plug."""
 
     def __init__(self, plug: list[Array], socket: list[Array]) -> None:

@@ -8,6 +8,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pytest
+from mesh_room import play_m, slack_m
 from ring_on_post import POST_M, POST_TOP_M, RING_BOTTOM_M, RING_HOLE_M, RING_TOP_M, folder_with_ring
 
 from lerobot_vtrefine.sim import meshes
@@ -35,12 +36,16 @@ def ring(folder: Path) -> MeshPair:
     return load_mesh_pair("automate/ring", folder, scale="unit", progress=False)
 
 
+def corners(pair: MeshPair) -> list[list[np.ndarray]]:
+    return [[hull.vertices for hull in part.pieces] for part in (pair.plug, pair.socket)]
+
+
 def test_ring_over_post_is_measured_from_its_pieces(ring: MeshPair) -> None:
     assert len(ring.plug.pieces) > 3  # one piece would close the hole
     assert ring.fit.travel_m == pytest.approx(POST_TOP_M - RING_BOTTOM_M, abs=3e-3)
-    assert ring.fit.play_m == pytest.approx(PLAY_M, abs=3e-4)  # the measure's overlap and step
-    assert ring.fit.has_stop == 1
-    assert ring.fit.slack_m < 2e-3
+    pieces = corners(ring)
+    assert play_m(*pieces) == pytest.approx(PLAY_M, abs=3e-4)  # the measure's overlap and step
+    assert slack_m(*pieces) < 2e-3
     np.testing.assert_allclose(ring.plug.bounds_m[:, 2], [RING_BOTTOM_M, RING_TOP_M], atol=1e-6)
 
 
@@ -72,6 +77,18 @@ def test_second_load_reads_the_cache(folder: Path, ring: MeshPair, monkeypatch: 
     assert again.fit == ring.fit
     for first, second in zip(ring.plug.pieces, again.plug.pieces, strict=True):
         np.testing.assert_array_equal(first.vertices, second.vertices)
+
+
+def test_entry_of_an_earlier_version_is_read(
+    folder: Path, ring: MeshPair, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It held what nothing asked for."""
+    for path in meshes.cache_dir().glob("fit-*.npz"):
+        with np.load(path) as stored:
+            arrays = dict(stored)
+        np.savez_compressed(path, **arrays, play_m=0.002, slack_m=0.0, has_stop=1.0)
+    monkeypatch.delattr(meshes, "measure_fit")
+    assert load_mesh_pair("automate/ring", folder, scale="unit", progress=False).fit == ring.fit
 
 
 @pytest.mark.parametrize("kept_bytes", [0, 6, 200])
@@ -188,9 +205,9 @@ def test_the_page_makes_a_pair_that_fits(tmp_path: Path, monkeypatch: pytest.Mon
     snippet = page.partition("```python\n")[2].partition("```")[0]
     monkeypatch.chdir(tmp_path)
     exec(compile(snippet, "own-pair.md", "exec"), {})
-    fit = load_mesh_pair("automate/peg", tmp_path, progress=False).fit
-    assert fit.travel_m == pytest.approx(0.030, abs=3e-3)
-    assert fit.play_m == pytest.approx(0.001, abs=1e-4)  # as the page says
+    pair = load_mesh_pair("automate/peg", tmp_path, progress=False)
+    assert pair.fit.travel_m == pytest.approx(0.030, abs=3e-3)
+    assert play_m(*corners(pair)) == pytest.approx(0.001, abs=1e-4)  # as the page says
 
 
 def test_own_parts_keep_their_size_unless_told_otherwise(folder: Path, ring: MeshPair) -> None:
