@@ -7,7 +7,7 @@ from pathlib import Path
 from lerobot_vtrefine import extras
 from lerobot_vtrefine.cli.arguments import CommandParser, ListAction
 from lerobot_vtrefine.cli.errors import run_cli
-from lerobot_vtrefine.cli.outputs import check_file
+from lerobot_vtrefine.cli.outputs import check_new_file
 from lerobot_vtrefine.drivers.config import PadConfig
 from lerobot_vtrefine.drivers.discovery import (
     FoundBoard,
@@ -40,6 +40,7 @@ def make_parser() -> CommandParser:
     parser.add_argument(
         "--output", type=Path, default=Path("pads.yaml"), help="file to write (default: %(default)s)"
     )
+    parser.add_argument("--overwrite", action="store_true", help="replace a pads file that is there already")
     parser.add_argument(
         "--names",
         action=ListAction,
@@ -80,7 +81,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     if not ports:
         raise PortError("no serial port found; plug in the boards, or name ports with --ports")
     if not options.list:
-        check_file("--output", options.output)
+        check_new_file("--output", options.output, overwrite=options.overwrite, how="--overwrite")
     with ExitStack() as stack:
         boards = find_boards(ports, stack, only_list=options.list)
         if options.list:

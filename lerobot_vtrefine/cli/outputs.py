@@ -46,6 +46,19 @@ def check_file(flag: str, path: Path) -> None:
     _try(path.parent, f"{flag}={path}")
 
 
+def check_new_file(flag: str, path: Path, *, overwrite: bool = False, how: str | None = None) -> None:
+    """As `check_file`; and no file that is there is replaced without ``overwrite``, which ``how`` sets.
+
+    Raises:
+        FileExistsError: it is there; or another OSError of `check_file`.
+    """
+    check_file(flag, path)
+    if path.exists() and not overwrite:
+        raise FileExistsError(
+            f"{path} exists; choose another {flag}" + (f" or add {how} to replace it" if how else "")
+        )
+
+
 def check_folder(flag: str, path: Path) -> None:
     """Raise OSError with the flag where no file can be written into a folder; make it where there is none."""
     if path.exists() and not path.is_dir():

@@ -22,7 +22,7 @@ from lerobot.utils.utils import init_logging
 from tqdm import tqdm
 
 from lerobot_vtrefine.cli.errors import after_interrupt, run_cli
-from lerobot_vtrefine.cli.outputs import check_file
+from lerobot_vtrefine.cli.outputs import OVERWRITE, check_new_file
 from lerobot_vtrefine.envs import VtRefineEnvConfig
 from lerobot_vtrefine.envs.config import checked_env
 from lerobot_vtrefine.envs.grasps import ExpertPlayer, Player, grasp_states
@@ -49,6 +49,8 @@ class RecordStartsConfig:
 
     path: Path
     """The file (.npz) to write, for --env.start_bank."""
+    overwrite: bool = False
+    """Replace a bank that is there already."""
     num_starts: int = 256
     """States that the bank shall hold."""
     attempts: float = 2.0
@@ -78,9 +80,10 @@ def record(config: RecordStartsConfig) -> dict[str, int]:
     """Write the bank; returns how many states came from whom.
 
     Raises:
+        FileExistsError: there is a bank already, and ``overwrite`` is not set.
         ValueError: not even the expert gets hold of both parts often enough.
     """
-    check_file("--path", config.path)
+    check_new_file("--path", config.path, overwrite=config.overwrite, how=OVERWRITE)
     env = replace(checked_env(config.env), start_bank=None, metrics_path=None)
     states: dict[int, Any] = {}
     counts: dict[str, int] = {}

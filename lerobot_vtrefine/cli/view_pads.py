@@ -22,7 +22,7 @@ from rich.text import Text
 from lerobot_vtrefine import extras
 from lerobot_vtrefine.cli.arguments import CommandParser, ListAction
 from lerobot_vtrefine.cli.errors import run_cli
-from lerobot_vtrefine.cli.outputs import check_file
+from lerobot_vtrefine.cli.outputs import check_new_file
 from lerobot_vtrefine.drivers.board import PadReader, Status
 from lerobot_vtrefine.drivers.config import PadConfig
 from lerobot_vtrefine.drivers.diagnostic import DiagnosticReader
@@ -144,7 +144,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     extras.require("vtrefine-view-pads", extras.PADS)
     decode(Rates, vars(options), "flags", "--", others=True)
     if options.save is not None:
-        check_file("--save", options.save)
+        check_new_file("--save", options.save)
     if options.diagnostic:
         view_taxel(options.diagnostic, options.channel, options.column, options.seconds)
         return

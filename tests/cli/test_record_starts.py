@@ -60,7 +60,9 @@ def test_a_policys_grasps_come_first_and_the_experts_where_there_are_none(
     assert "0 by the policy and 2 by the expert" in capsys.readouterr().out
     assert read_arrays(path, "iufbU")["source"].tolist() == [2, 3]  # episodes that the policy has not played
     monkeypatch.setattr(InsertionSim, "in_hand", property(lambda sim: sim.steps >= 3))
-    assert record(path, monkeypatch, *few) == 0
+    assert record(path, monkeypatch, *few) == 2
+    assert f"{path} exists; choose another --path or add --overwrite=true" in capsys.readouterr().err
+    assert record(path, monkeypatch, *few, "--overwrite=true") == 0
     assert "2 by the policy" in capsys.readouterr().out
     assert steps_of(path) == [8, 8]  # when the policy decides again
 

@@ -4,6 +4,7 @@ import io
 import os
 import signal
 import threading
+from collections.abc import Callable
 from contextlib import ExitStack, redirect_stdout
 from pathlib import Path
 
@@ -317,3 +318,21 @@ def test_bad_usage_is_one_line_and_status_2(
     error = capsys.readouterr().err.strip()
     assert message in error
     assert "\n" not in error
+
+
+@pytest.mark.parametrize(
+    ("command", "flag", "way_out"),
+    [(find_pads, "--output", " or add --overwrite to replace it"), (view_pads, "--save", "")],
+)
+def test_what_was_made_at_the_robot_is_not_replaced_unasked(
+    command: Callable[[list[str]], int], flag: str, way_out: str, tmp_path: Path, capsys
+) -> None:
+    """Told before a pad is pressed: a pads file may have been edited by hand, a live recording comes once."""
+    there = tmp_path / "there"
+    there.write_text("an hour's work")
+    assert command(["--ports", "/nowhere/pty", f"{flag}={there}"]) == 2
+    assert capsys.readouterr().err == f"error: {there} exists; choose another {flag}{way_out}\n"
+    if way_out:
+        assert command(["--ports", "/nowhere/pty", f"{flag}={there}", "--overwrite"]) == 2
+        assert "/nowhere/pty does not exist" in capsys.readouterr().err
+    assert there.read_text() == "an hour's work"
