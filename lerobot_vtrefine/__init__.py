@@ -10,7 +10,8 @@ simulator, Warp, serial port or plotting library at all.
 import sys
 
 from lerobot_vtrefine.lerobot_compat import decoder_notice
-from lerobot_vtrefine.lerobot_compat.registration import LEROBOT, refuse_missing_dataset, register
+from lerobot_vtrefine.lerobot_compat.local_places import refuse_missing_places
+from lerobot_vtrefine.lerobot_compat.registration import LEROBOT, register
 from lerobot_vtrefine.shipped import expand_command_line
 
 __all__ = ["register"]
@@ -19,4 +20,4 @@ decoder_notice.install()
 if LEROBOT in sys.modules:  # LeRobot's commands import plugins just before they parse their command line
     register()
     expand_command_line()
-    refuse_missing_dataset()
+    refuse_missing_places()

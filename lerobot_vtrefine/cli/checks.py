@@ -9,6 +9,7 @@ import yaml
 
 from lerobot_vtrefine.cli.errors import CONFIG_FLAG, meant, values_of
 from lerobot_vtrefine.cli.flags import Flag, flags_of
+from lerobot_vtrefine.lerobot_compat.local_places import may_be_on_the_hub, misnamed_policy
 from lerobot_vtrefine.shipped import KINDS, PREFIX
 
 WANTED = {"env": "say which task, --config_path=vtrefine:NAME or --env.type=vtrefine."}
@@ -20,8 +21,6 @@ PATHS = (CONFIG_FLAG, "--policy.path")
 FOLDERS = ("--dataset.root",)
 RESULTS = "--output_dir"
 """Folder that a command writes."""
-BELOW = ("pretrained_model", "checkpoints/last/pretrained_model")
-"""Where a policy lies in the folder of a checkpoint, and of a run."""
 
 
 def check_arguments(flags: Sequence[Flag], arguments: Sequence[str]) -> None:
@@ -57,29 +56,16 @@ def _check_known(flags: Sequence[Flag], arguments: Sequence[str]) -> None:
 def _check_places(arguments: Sequence[str]) -> None:
     for flag in (*PATHS, *FOLDERS):
         for given in values_of(flag, arguments):
-            if not Path(given).exists() and (flag in FOLDERS or not _may_be_on_the_hub(given)):
+            if not Path(given).exists() and (flag in FOLDERS or not may_be_on_the_hub(given)):
                 if flag in PATHS and given in KINDS[flag][1]():
                     raise ValueError(f"no such file: {flag}={given}; did you mean {flag}={PREFIX}{given}?")
                 raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), f"{flag}={given}")
     for given in map(Path, values_of("--policy.path", arguments)):
-        if given.exists() and not (given / "config.json").is_file():
-            way_out = where_policy_is(given) or "name a checkpoint's pretrained_model"
-            raise ValueError(f"--policy.path={given} is not a policy's own folder: {way_out}")
+        if given.exists() and (problem := misnamed_policy(given)):
+            raise ValueError(problem)
     for given in map(Path, values_of(RESULTS, arguments)):
         if given.is_file():
             raise NotADirectoryError(f"{RESULTS}={given} is a file; name a folder")
-
-
-def where_policy_is(folder: Path) -> str:
-    """What to take in place of the folder of a checkpoint or of a run; empty where it is neither."""
-    inside = [folder / below for below in BELOW if (folder / below / "config.json").is_file()]
-    return f"take {inside[0]}" if inside else ""
-
-
-def _may_be_on_the_hub(name: str) -> bool:
-    """Whether it reads as USER/NAME."""
-    user, slash, rest = name.partition("/")
-    return bool(slash and rest) and "/" not in rest and not user.startswith((".", "~")) and user != ""
 
 
 def _check_required(flags: Sequence[Flag], arguments: Sequence[str]) -> None:

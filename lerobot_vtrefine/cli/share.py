@@ -4,9 +4,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from lerobot_vtrefine.cli.arguments import CommandParser
-from lerobot_vtrefine.cli.checks import where_policy_is
 from lerobot_vtrefine.cli.errors import run_cli
 from lerobot_vtrefine.cli.hub import check_upload, is_checkpoint
+from lerobot_vtrefine.lerobot_compat.local_places import where_policy_is
 
 DESCRIPTION = """\
 Upload a dataset or a policy to the Hugging Face Hub. A policy goes with its processors, without which nobody

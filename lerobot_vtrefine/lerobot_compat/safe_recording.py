@@ -32,8 +32,8 @@ from lerobot_vtrefine.folders import sync
 from lerobot_vtrefine.lerobot_compat.claim import Claim
 from lerobot_vtrefine.lerobot_compat.episode_rows import video_length_s
 from lerobot_vtrefine.lerobot_compat.guard import is_supported
+from lerobot_vtrefine.lerobot_compat.local_places import LOCAL
 from lerobot_vtrefine.lerobot_compat.recovery import recover, tidy
-from lerobot_vtrefine.lerobot_compat.registration import LOCAL
 from lerobot_vtrefine.lerobot_compat.safe_metadata import (
     SafeMetadata,
     is_empty,

@@ -6,7 +6,9 @@ from dataclasses import fields
 from pathlib import Path
 from types import SimpleNamespace
 
+import httpx
 import pytest
+from huggingface_hub.errors import LocalEntryNotFoundError, RepositoryNotFoundError
 
 from lerobot_vtrefine import shipped
 from lerobot_vtrefine.cli import launch, umbrella
@@ -14,7 +16,7 @@ from lerobot_vtrefine.cli.arguments import with_brackets
 from lerobot_vtrefine.cli.checks import check_arguments
 from lerobot_vtrefine.cli.flags import flags_of
 from lerobot_vtrefine.cli.pipeline.demo_config import DemoConfig
-from lerobot_vtrefine.lerobot_compat.registration import refuse_missing_dataset
+from lerobot_vtrefine.lerobot_compat.local_places import refuse_missing_places
 
 FINETUNE = ("lerobot_vtrefine.finetune.pipeline", "FinetunePipelineConfig")
 RECORD = ("lerobot_vtrefine.cli.record_demos", "RecordDemosConfig")
@@ -304,7 +306,7 @@ def test_a_local_dataset_that_is_not_there_is_named(monkeypatch, tmp_path: Path)
 
     def run(command: str, *flags: str, name: str = "local/demos") -> None:
         monkeypatch.setattr(sys, "argv", [f"/bin/{command}", f"--dataset.repo_id={name}", *flags])
-        refuse_missing_dataset()
+        refuse_missing_places()
 
     at_root = f"--dataset.root={root}"
     with pytest.raises(SystemExit, match=f"error: {at_root} holds no recorded episodes: there is no {root}"):
@@ -324,6 +326,50 @@ def test_a_local_dataset_that_is_not_there_is_named(monkeypatch, tmp_path: Path)
     run("lerobot-train", at_root)
     run("lerobot-replay")
     run("lerobot-record", at_root, "--resume=true")
+
+
+def test_a_policy_that_is_not_there_is_named(monkeypatch, tmp_path: Path) -> None:
+    """LeRobot tells of the name that no Hub would take, or of the network, in fifty to eighty lines."""
+    own = tmp_path / "run" / "checkpoints" / "last" / "pretrained_model"
+    own.mkdir(parents=True)
+    (own / "config.json").write_text("{}")
+    (tmp_path / "empty").mkdir()
+    monkeypatch.chdir(tmp_path)
+    asked = []
+
+    def hub(name: str, file: str) -> str:
+        asked.append((name, file))
+        raise answers[name](name)
+
+    def not_found(name: str) -> Exception:
+        response = httpx.Response(404, request=httpx.Request("GET", "https://hub.example"))
+        return RepositoryNotFoundError(name, response=response)
+
+    answers = {"outputs/polcy": not_found, "me/insertion": LocalEntryNotFoundError}
+    monkeypatch.setattr("huggingface_hub.hf_hub_download", hub)
+
+    def told(path: str, command: str = "lerobot-eval") -> str:
+        monkeypatch.setattr(sys, "argv", [f"/bin/{command}", f"--policy.path={path}"])
+        try:
+            refuse_missing_places()
+        except SystemExit as stop:
+            return str(stop)
+        return ""
+
+    nowhere = "there is no such folder; name a checkpoint's pretrained_model"
+    for command in ("lerobot-train", "lerobot-eval", "lerobot-rollout"):
+        assert told("outputs/a/b", command) == f"error: --policy.path=outputs/a/b: {nowhere}"
+    assert told("polcy") == f"error: --policy.path=polcy: {nowhere}"
+    assert told("empty").endswith("=empty is not a policy's own folder: name a checkpoint's pretrained_model")
+    assert told("run").endswith("is not a policy's own folder: take run/checkpoints/last/pretrained_model")
+    assert told(str(own)) == told("outputs/a/b", "lerobot-info") == ""
+    assert not asked
+    assert told("outputs/polcy").endswith(
+        "/polcy: there is no such folder, and the Hub has no policy of this name that this account may read"
+    )
+    assert told("me/insertion").endswith("no such folder, and the Hub, where it may be, does not answer")
+    monkeypatch.setattr("huggingface_hub.hf_hub_download", lambda *_: "config.json")
+    assert told("me/insertion") == ""
 
 
 def test_stock_commands_get_the_path_when_they_discover_the_plugin(monkeypatch) -> None:
