@@ -24,8 +24,9 @@ from reality.outcome import reality_rows
 
 from lerobot_vtrefine.cli.arguments import CommandParser
 from lerobot_vtrefine.cli.errors import run_cli
-from lerobot_vtrefine.cli.results.collect import ORIGIN, origin_of, printed_lines, run_rows, save
+from lerobot_vtrefine.cli.results.collect import ORIGIN, origin_of, printed_lines, run_rows
 from lerobot_vtrefine.cli.results.rows import Line, Run
+from lerobot_vtrefine.cli.results.store import save
 
 RESULTS = Path(__file__).parents[1] / "results"
 

@@ -41,8 +41,8 @@ from lerobot_vtrefine.cli.arguments import CommandParser
 from lerobot_vtrefine.cli.errors import run_cli
 from lerobot_vtrefine.cli.pipeline.demo_config import RECIPES
 from lerobot_vtrefine.cli.pipeline.stages import StageRunner
-from lerobot_vtrefine.cli.results.collect import save
 from lerobot_vtrefine.cli.results.published import DEMONSTRATIONS
+from lerobot_vtrefine.cli.results.store import save
 from lerobot_vtrefine.finetune.distributed import check_device
 
 RESULTS = Path(__file__).parents[1] / "results"

@@ -23,9 +23,9 @@ from lerobot_vtrefine.cli.errors import run_cli
 from lerobot_vtrefine.cli.pipeline.demo_config import EVAL_SEED_OFFSET
 from lerobot_vtrefine.cli.pipeline.stages import Stage, StageRunner, evaluation_stage, trained_policy
 from lerobot_vtrefine.cli.report.results import load_evaluation
-from lerobot_vtrefine.cli.results.collect import save
 from lerobot_vtrefine.cli.results.provenance import provenance
 from lerobot_vtrefine.cli.results.rows import Run
+from lerobot_vtrefine.cli.results.store import save
 from lerobot_vtrefine.finetune.distributed import check_device
 from lerobot_vtrefine.shipped import PREFIX, find
 

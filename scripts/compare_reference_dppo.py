@@ -26,9 +26,10 @@ from reference.insertion.theirs import train_reference
 
 from lerobot_vtrefine.cli.arguments import CommandParser
 from lerobot_vtrefine.cli.errors import run_cli
-from lerobot_vtrefine.cli.results.collect import largest_fall, read_json_or_none, save, steps_to
+from lerobot_vtrefine.cli.results.collect import largest_fall, read_json_or_none, steps_to
 from lerobot_vtrefine.cli.results.provenance import provenance
 from lerobot_vtrefine.cli.results.rows import Row, Run
+from lerobot_vtrefine.cli.results.store import save
 from lerobot_vtrefine.finetune.pipeline import Practice
 
 ROOT = Path(__file__).parents[1]

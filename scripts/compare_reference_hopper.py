@@ -36,9 +36,9 @@ from reference.hopper.worlds import CHUNK, N_STEPS, NUM_ENVS, make_worlds
 
 from lerobot_vtrefine.cli.arguments import CommandParser
 from lerobot_vtrefine.cli.errors import run_cli
-from lerobot_vtrefine.cli.results.collect import save
 from lerobot_vtrefine.cli.results.provenance import provenance
 from lerobot_vtrefine.cli.results.rows import Row
+from lerobot_vtrefine.cli.results.store import save
 
 ROOT = Path(__file__).parents[1]
 

@@ -19,8 +19,9 @@ from runs.side_by_side import run_all
 from lerobot_vtrefine.cli.arguments import CommandParser
 from lerobot_vtrefine.cli.errors import run_cli
 from lerobot_vtrefine.cli.results.cells import percent, share
-from lerobot_vtrefine.cli.results.collect import origin_of, save
+from lerobot_vtrefine.cli.results.collect import origin_of
 from lerobot_vtrefine.cli.results.rows import Line
+from lerobot_vtrefine.cli.results.store import save
 from lerobot_vtrefine.information import estimator
 from lerobot_vtrefine.information.contact import SIDE
 

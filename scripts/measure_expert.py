@@ -19,9 +19,9 @@ from tqdm import tqdm
 
 from lerobot_vtrefine.cli.arguments import CommandParser
 from lerobot_vtrefine.cli.errors import run_cli
-from lerobot_vtrefine.cli.results.collect import save
 from lerobot_vtrefine.cli.results.provenance import provenance
 from lerobot_vtrefine.cli.results.rows import Run, read_rows
+from lerobot_vtrefine.cli.results.store import save
 from lerobot_vtrefine.embodiments import get_embodiment
 from lerobot_vtrefine.embodiments.embodiment import STARTS
 from lerobot_vtrefine.sim.config import MESH_PAIR_PREFIX, PROCEDURAL_PAIRS, SceneConfig

@@ -14,9 +14,9 @@ from tqdm import tqdm
 from lerobot_vtrefine.cli.arguments import CommandParser, read_list
 from lerobot_vtrefine.cli.errors import run_cli
 from lerobot_vtrefine.cli.results.cells import share
-from lerobot_vtrefine.cli.results.collect import save
 from lerobot_vtrefine.cli.results.provenance import provenance
 from lerobot_vtrefine.cli.results.rows import Line
+from lerobot_vtrefine.cli.results.store import save
 from lerobot_vtrefine.finetune.config import TrustRegionDppo
 from lerobot_vtrefine.finetune.evaluation import evaluate
 from lerobot_vtrefine.finetune.pipeline import load_practice

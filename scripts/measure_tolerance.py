@@ -17,9 +17,9 @@ from tqdm import tqdm
 from lerobot_vtrefine.cli.arguments import CommandParser
 from lerobot_vtrefine.cli.errors import run_cli
 from lerobot_vtrefine.cli.results.cells import share
-from lerobot_vtrefine.cli.results.collect import save
 from lerobot_vtrefine.cli.results.provenance import provenance
 from lerobot_vtrefine.cli.results.rows import Line
+from lerobot_vtrefine.cli.results.store import save
 from lerobot_vtrefine.finetune.pipeline import env_of
 from lerobot_vtrefine.information.tolerance import LATERAL, SIZES, Tolerated, tolerance
 from lerobot_vtrefine.shipped import find

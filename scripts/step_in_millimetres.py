@@ -23,9 +23,9 @@ from torch import Tensor
 
 from lerobot_vtrefine.cli.arguments import CommandParser
 from lerobot_vtrefine.cli.errors import run_cli
-from lerobot_vtrefine.cli.results.collect import save
 from lerobot_vtrefine.cli.results.provenance import provenance
 from lerobot_vtrefine.cli.results.rows import Line
+from lerobot_vtrefine.cli.results.store import save
 from lerobot_vtrefine.finetune import dppo
 from lerobot_vtrefine.finetune.chains import chain_log_probs, decision_kl
 from lerobot_vtrefine.finetune.config import DppoConfig, TrustRegionDppo

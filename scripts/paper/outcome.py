@@ -6,9 +6,9 @@ import sys
 from typing import Any
 
 from lerobot_vtrefine.cli.report.results import load_evaluation
-from lerobot_vtrefine.cli.results.collect import Progress, largest_fall, last_steps
+from lerobot_vtrefine.cli.results.collect import largest_fall, last_steps
 from lerobot_vtrefine.cli.results.provenance import provenance
-from lerobot_vtrefine.cli.results.rows import Row, Run, read_rows
+from lerobot_vtrefine.cli.results.rows import Progress, Row, Run, read_rows
 from lerobot_vtrefine.cli.results.tables import MEASURED
 from lerobot_vtrefine.finetune.logger import read_progress
 from paper.trained import Trained, first_seed, iterations_of, key, table_of, variants

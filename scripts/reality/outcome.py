@@ -6,8 +6,8 @@ from typing import Any
 
 from runs.comparison import difference, over_seeds
 
-from lerobot_vtrefine.cli.results.collect import Progress, last_steps, read_json_or_none
-from lerobot_vtrefine.cli.results.rows import Run
+from lerobot_vtrefine.cli.results.collect import last_steps, read_json_or_none
+from lerobot_vtrefine.cli.results.rows import Progress, Run
 from lerobot_vtrefine.finetune.logger import read_progress
 from reality.budget import Budget, folder_name
 from reality.hidden import REALITIES

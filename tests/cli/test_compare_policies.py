@@ -10,8 +10,8 @@ from pathlib import Path
 import compare_policies as script
 import pytest
 
-from lerobot_vtrefine.cli.results import collect
 from lerobot_vtrefine.cli.results.rows import Run, read_rows
+from lerobot_vtrefine.cli.results.store import save
 from lerobot_vtrefine.cli.results.tables import table
 
 
@@ -86,7 +86,7 @@ def _save_rows(path: Path, first: int) -> None:
             env_steps=0,
             **origin,
         )
-        collect.save(path, [(row, [])], replace=False)
+        save(path, [(row, [])], replace=False)
 
 
 def test_rows_that_come_together_are_all_kept(tmp_path: Path) -> None:

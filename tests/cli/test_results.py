@@ -17,7 +17,7 @@ from lerobot_vtrefine.cli import demo
 from lerobot_vtrefine.cli.report.statistics import mean_interval, wilson_interval
 from lerobot_vtrefine.cli.results import provenance
 from lerobot_vtrefine.cli.results.cells import difference, over_seeds, pooled
-from lerobot_vtrefine.cli.results.collect import largest_fall, run_rows, save, steps_to
+from lerobot_vtrefine.cli.results.collect import largest_fall, run_rows, steps_to
 from lerobot_vtrefine.cli.results.paper_tables import FURTHER, JUDGED_ANEW, practised
 from lerobot_vtrefine.cli.results.published import PAIRS, with_demonstrations
 from lerobot_vtrefine.cli.results.rows import (
@@ -32,6 +32,7 @@ from lerobot_vtrefine.cli.results.rows import (
     read_rows,
     write_rows,
 )
+from lerobot_vtrefine.cli.results.store import save
 from lerobot_vtrefine.cli.results.tables import BLOCK, DERIVED, fill, table
 from lerobot_vtrefine.finetune.logger import ProgressLog
 from lerobot_vtrefine.finetune.pipeline import CONFIG_NAME

@@ -1,27 +1,18 @@
-"""Rows and learning curves from the folders that runs leave, and from printed tables."""
+"""Makes rows and learning curves from the folders that runs leave, and from printed tables."""
 
-import csv
-import fcntl
 import json
-import os
-import re
-from collections.abc import Generator
-from contextlib import contextmanager
 from dataclasses import replace as replace_fields
 from pathlib import Path
 from typing import Any
 
 from lerobot_vtrefine.cli.pipeline.stages import trained_policy
 from lerobot_vtrefine.cli.results.provenance import FILE_NAME
-from lerobot_vtrefine.cli.results.rows import IMITATION, TUNED, Line, Row, Run, merge, read_rows, write_rows
+from lerobot_vtrefine.cli.results.rows import IMITATION, TUNED, Line, Progress, Row, Run
 from lerobot_vtrefine.cli.results.tables import HANDLING, MEASURED, REACHED
 from lerobot_vtrefine.finetune.logger import read_progress
 from lerobot_vtrefine.finetune.pipeline import CONFIG_NAME
 
-CURVE_COLUMNS = ("iteration", "env_steps", "success", "eval_success", "seconds", "actor_lr", "decision_kl")
 ORIGIN = ("commit", "command", "machine")
-
-Progress = list[dict[str, float]]
 
 
 def read_json_or_none(path: Path) -> Any:
@@ -196,61 +187,3 @@ def printed_lines(path: Path, name: str, origin: dict[str, str | None]) -> list[
     if len(cells) < 3:
         raise ValueError(f"{path} holds no Markdown table")
     return [Line(table=name, cells=dict(zip(cells[0], row, strict=True)), **origin) for row in cells[2:]]
-
-
-def save(path: Path, found: list[tuple[Row, Progress]], *, replace: bool) -> None:
-    """Put rows and curves into a results file; ``replace`` drops their groups' earlier rows, of all seeds.
-
-    Curves carry the file's name and lie beside it in ``curves/``; those that no row names any more are
-    removed. Processes that end at the same time wait for each other.
-    """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with only_one_in(path.parent):
-        _save(path, found, replace)
-
-
-@contextmanager
-def only_one_in(folder: Path) -> Generator[None]:
-    """Wait until no other process is in here for this folder."""
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX)
-        yield
-    finally:
-        os.close(descriptor)
-
-
-def _save(path: Path, found: list[tuple[Row, Progress]], replace: bool) -> None:
-    old = read_rows(path) if path.is_file() else []
-    rows = []
-    for row, progress in found:
-        if isinstance(row, Run) and progress:
-            label = re.sub(
-                r"[^\w.]+", "_", "_".join(filter(None, (row.task, row.policy, row.variant, str(row.seed))))
-            )
-            row = replace_fields(row, curve=f"curves/{path.stem}-{label}.csv")
-            write_curve(path.parent / str(row.curve), progress)
-        rows.append(row)
-    groups = {row.key[:-1] for row in rows} if replace else set()
-    rows = merge([row for row in old if row.key[:-1] not in groups], rows)
-    write_rows(path, rows)
-    for curve in _curves(path, old) - _curves(path, rows):
-        curve.unlink(missing_ok=True)
-
-
-def _curves(path: Path, rows: list[Row]) -> set[Path]:
-    """Curves of a results file's own that rows of it name: those of a copied row stay the other file's."""
-    named = {path.parent / row.curve for row in rows if isinstance(row, Run) and row.curve}
-    return {curve for curve in named if curve.name.startswith(f"{path.stem}-")}
-
-
-def write_curve(path: Path, progress: Progress) -> None:
-    """The columns of ``progress.csv`` that matter, in four digits."""
-    columns = [name for name in CURVE_COLUMNS if any(name in row for row in progress)]
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(columns)
-        for row in progress:
-            numbers = [row.get(name) for name in columns]
-            writer.writerow("" if n is None else str(int(n)) if n == int(n) else f"{n:.4g}" for n in numbers)

@@ -17,6 +17,9 @@ COMMIT = re.compile(r"[0-9a-f]{7,40}\+?")
 IMITATION, SCRATCH, TUNED = "imitation", "without pre-training", ""
 """Variants of a run: not fine-tuned, fine-tuned from random weights, fine-tuned from imitation."""
 
+Progress = list[dict[str, float]]
+"""A run's learning curve: what each iteration logged."""
+
 
 @dataclass(frozen=True)
 class Row:
