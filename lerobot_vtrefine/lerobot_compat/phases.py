@@ -89,7 +89,7 @@ def watch_replay(robot: PhasedRobot) -> None:
 
     Once: another robot that is replayed later in this process is none of this one's business.
     """
-    for module in _modules(REPLAY):
+    for module in loaded_modules(REPLAY):
         _unwatch(module)
         make, open_ = module.make_robot_from_config, module.LeRobotDataset
 
@@ -116,7 +116,7 @@ def uninstall() -> None:
     """Restore LeRobot's own loops."""
     for owner, name in _loaded():
         _restore(owner, name)
-    for module in _modules(REPLAY):
+    for module in loaded_modules(REPLAY):
         _unwatch(module)
 
 
@@ -125,7 +125,7 @@ def _restore(owner: Any, name: str) -> None:
     setattr(owner, name, getattr(loop, "unphased", loop))
 
 
-def _modules(name: str) -> list[Any]:
+def loaded_modules(name: str) -> list[Any]:
     """A module that is loaded, also as the script that runs."""
     main = sys.modules["__main__"]
     modules = [sys.modules[name]] if name in sys.modules else []
@@ -137,7 +137,7 @@ def _modules(name: str) -> list[Any]:
 def _loaded() -> Iterator[tuple[Any, str]]:
     """Module or class, and name, of every loop whose module is loaded."""
     for module_name, class_name, name in LOOPS:
-        for module in _modules(module_name):
+        for module in loaded_modules(module_name):
             yield (module if class_name is None else getattr(module, class_name)), name
 
 

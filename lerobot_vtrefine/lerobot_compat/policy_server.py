@@ -20,6 +20,7 @@ from lerobot.transport import services_pb2_grpc
 from lerobot.utils.constants import OBS_STR
 
 from lerobot_vtrefine.lerobot_compat import arrays
+from lerobot_vtrefine.lerobot_compat.action_rates import RATE
 from lerobot_vtrefine.lerobot_compat.guard import is_supported
 
 POLICY = "vt_dp3"
@@ -39,6 +40,19 @@ class PadPolicyServer(policy_server.PolicyServer):
     postprocessor: Any
     lerobot_features: Any
     device: Any
+
+    def SendPolicyInstructions(self, request: Any, context: grpc.ServicerContext) -> Any:  # noqa: N802
+        """As LeRobot's; the client is told in one line of no such policy, and of one of another rate."""
+        try:
+            answer = super().SendPolicyInstructions(request, context)
+            fps = dict(context.invocation_metadata()).get(RATE)
+            if fps is not None and hasattr(self.policy.config, "check_fps"):
+                self.policy.config.check_fps(float(fps), "--fps")
+        except (ValueError, OSError, ImportError) as error:
+            context.abort(
+                grpc.StatusCode.FAILED_PRECONDITION, f"policy server: {' '.join(str(error).split())}"
+            )
+        return answer
 
     def _reset_server(self) -> None:
         super()._reset_server()

@@ -156,9 +156,10 @@ SEAMS = (
         (
             "lerobot.scripts.lerobot_train.make_train_eval_datasets",
             "lerobot.scripts.lerobot_rollout.build_rollout_context",
+            "lerobot.async_inference.robot_client.RobotClient.start",
         ),
-        "lerobot-train evaluates at any --env.fps and lerobot-rollout moves arms at any --fps, whatever the"
-        " dataset's",
+        "lerobot-train evaluates at any --env.fps; lerobot-rollout and the client of asynchronous inference"
+        " move arms at any --fps, whatever the dataset's",
         "LeRobot's commands, when they discover plugins",
         "leaves the check out",
     ),

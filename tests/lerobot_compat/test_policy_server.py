@@ -18,7 +18,7 @@ from ports import free_port
 
 from lerobot_vtrefine.cli.policy_server import main
 from lerobot_vtrefine.datasets.features import ACTION_KEY, STATE_KEY
-from lerobot_vtrefine.lerobot_compat import arrays
+from lerobot_vtrefine.lerobot_compat import action_rates, arrays
 from lerobot_vtrefine.observation import VisuoTactileConfig
 from lerobot_vtrefine.policies.vt_dp3.configuration_vt_dp3 import VtDp3Config
 from lerobot_vtrefine.policies.vt_dp3.modeling_vt_dp3 import VtDp3Policy
@@ -108,6 +108,55 @@ def test_a_simulated_robot_follows_a_policy_that_is_served(checkpoint: Path) -> 
         assert waited(lambda: world.steps > 3 * CHUNK, 60)  # several chunks, each planned from pads and depth
     finally:
         client.stop()
+        server.stop(grace=None)
+
+
+@pytest.mark.parametrize(
+    ("fps", "learned", "name", "told"),
+    [
+        (30, 30, None, "--robot.fps=10, but this command gives 30 actions a second"),
+        (10, 20, None, "policy server: --fps=10, but the policy learned 20 actions a second: give --fps=20"),
+        (10, 10, "no/such/policy", "policy server: .*no/such/policy"),
+        (10, 10, None, None),
+    ],
+    ids=["another rate than the robot's", "another than the policy's", "no policy", "the same"],
+)
+def test_no_arm_moves_at_another_rate_than_learned(
+    fps: int, learned: int, name: str | None, told: str | None, checkpoint: Path, monkeypatch
+) -> None:
+    from lerobot.async_inference.configs import RobotClientConfig
+    from lerobot.async_inference.robot_client import RobotClient
+
+    from lerobot_vtrefine.lerobot_compat.policy_server import start
+
+    config = VtDp3Config.from_pretrained(checkpoint)
+    config.fps = learned
+    config.save_pretrained(checkpoint)
+    monkeypatch.setattr(RobotClient, "start", RobotClient.start)  # put back at the end
+    action_rates.install()
+    action_rates.install()
+    port = free_port()
+    server = start("127.0.0.1", port, fps=10)
+    client = RobotClient(
+        RobotClientConfig(
+            policy_type="vt_dp3",
+            pretrained_name_or_path=name or str(checkpoint),
+            robot=VtRefineSimConfig(env=ENV),
+            actions_per_chunk=CHUNK,
+            server_address=f"localhost:{port}",
+            fps=fps,
+        )
+    )
+    try:
+        if told is None:
+            assert client.start()
+            return
+        with pytest.raises(SystemExit, match=f"^error: {told}"):
+            client.start()
+        assert not client.robot.is_connected
+    finally:
+        if client.robot.is_connected:
+            client.stop()
         server.stop(grace=None)
 
 

@@ -154,12 +154,17 @@ def safe_recording_(folder: Path) -> None:
 
 @probe
 def action_rates_(_: Path) -> None:
+    pytest.importorskip("grpc")
+    from lerobot.async_inference import robot_client
     from lerobot.rollout import context
     from lerobot.scripts import lerobot_rollout, lerobot_train
 
     assert "fps" not in inspect.getsource(lerobot_train)
     assert "build_rollout_context(cfg" in inspect.getsource(lerobot_rollout)
     assert not re.search(r"polic\S*fps", inspect.getsource(context))
+    assert "policy_config = RemotePolicyConfig(" in inspect.getsource(robot_client)
+    assert "fps" not in inspect.getsource(robot_client.RobotClient.start)
+    assert "fps" not in inspect.getsource(robot_client.RemotePolicyConfig)
 
 
 def small_dataset(folder: Path) -> LeRobotDataset:
