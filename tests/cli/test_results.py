@@ -76,6 +76,21 @@ def test_curves_are_small_and_belong_to_rows() -> None:
     assert sum(path.stat().st_size for path in RESULTS.rglob("*") if path.is_file()) < 2_000_000
 
 
+def test_the_gain_by_dppo_that_pages_quote_is_that_of_the_rows() -> None:
+    """Imitations are means over seeds there, so no more than the average can be quoted from them."""
+    rows = [row for row in read_rows(RESULTS / "touch.json") if isinstance(row, Run)]
+    before = {(row.task, row.policy): row.success for row in rows if row.variant == IMITATION}
+    tuned = [row for row in rows if row.variant == TUNED and row.seed is not None]
+    gain = sum(row.success - before[row.task, row.policy] for row in tuned) / len(tuned)
+    told = f"by {100 * gain:.0f} points on average"
+    assert f"DPPO lifts {len(tuned)} policies {told}" in words_of("README.md")
+    assert f"DPPO lifts them {told}" in words_of("docs/results.md")
+
+
+def words_of(page: str) -> str:
+    return " ".join((ROOT / page).read_text(encoding="utf-8").split())
+
+
 def test_a_changed_figure_changes_the_document(tmp_path: Path) -> None:
     rows = [run_of(0.5, seed, policy=name) for seed in (0, 1) for name in ("visuo_tactile", "visual")]
     text = fill("# Title\n<!-- table: touch -->\nold\n<!-- end -->\nafter\n", rows)
