@@ -7,11 +7,12 @@ and that nothing imports LeRobot's dataset code before it is needed.
 import logging
 from collections.abc import Sequence
 from multiprocessing.context import get_spawning_popen
-from typing import Any, override
+from typing import Any, overload, override
 
 from lerobot.datasets.dataset_reader import DatasetReader
 from lerobot.datasets.depth_utils import MM_PER_METRE
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from torch.utils.data import default_collate
 from torch.utils.data._utils.collate import default_collate_fn_map
 
 from lerobot_vtrefine.datasets.features import TACTILE_PREFIX
@@ -62,13 +63,14 @@ class FastDatasetReader(DatasetReader):
         item["task"] = store.tasks[int(item["task_index"])]
         return item
 
-    def get_batch(self, indices: Sequence[int]) -> PackedBatch | None:
-        """What a data loader would collate from the items, read at once, with counts as uint8; None where it
-        must read items.
-        """
+    def reads_batches(self) -> bool:
+        """Whether `get_batch` is right: not with image transforms, which may be random, one draw per item."""
+        return self._frame_store() is not None and self._image_transforms is None
+
+    def get_batch(self, indices: Sequence[int]) -> PackedBatch:
+        """What a data loader would collate from the items, read at once, with counts as uint8."""
         store = self._frame_store()
-        if store is None or self._image_transforms is not None:  # these may be random, one draw per item
-            return None
+        assert store is not None
         batch = store.batch(indices)
         self._finish(batch)
         batch["task"] = [store.tasks[index] for index in batch["task_index"].tolist()]
@@ -84,21 +86,46 @@ class FastDatasetReader(DatasetReader):
                 item[key] = item[key] * MM_PER_METRE if unit == "m" else item[key] / MM_PER_METRE
 
 
+class Item(dict[str, Any]):
+    """An item of a dataset that can read a whole batch."""
+
+
+class Together(Sequence[Item]):
+    """Items of a dataset, which the data loader's own collation reads at once; any other gets the items."""
+
+    def __init__(self, dataset: Any, indices: Sequence[int]) -> None:
+        self.dataset, self.indices = dataset, indices
+
+    def __len__(self) -> int:
+        return len(self.indices)
+
+    @overload
+    def __getitem__(self, place: int) -> Item: ...
+    @overload
+    def __getitem__(self, place: slice) -> "Together": ...
+    def __getitem__(self, place: int | slice) -> "Item | Together":
+        if isinstance(place, slice):
+            return Together(self.dataset, self.indices[place])
+        return Item(self.dataset[self.indices[place]])
+
+
 def serve_batches() -> None:
     """Let data loaders ask LeRobot's datasets for whole batches. Idempotent."""
     dataset_class: Any = LeRobotDataset
-    dataset_class.__getitems__ = _items_at_once
-    default_collate_fn_map[PackedBatch] = _as_it_is
+    dataset_class.__getitems__ = _items_together
+    default_collate_fn_map[Item] = _read_at_once
 
 
-def _items_at_once(dataset: Any, indices: Sequence[int]) -> list[Any]:
+def _items_together(dataset: Any, indices: Sequence[int]) -> Sequence[Any]:
     """``Dataset.__getitems__``, which a data loader calls in place of reading item by item."""
     reader = getattr(dataset, "reader", None)
-    batch = None
-    if isinstance(reader, FastDatasetReader) and dataset.writer is None:
-        batch = reader.get_batch(indices)
-    return [dataset[index] for index in indices] if batch is None else [batch]
+    plain = type(dataset).__getitem__ is LeRobotDataset.__getitem__  # or items are more than was recorded
+    if plain and isinstance(reader, FastDatasetReader) and dataset.writer is None and reader.reads_batches():
+        return Together(dataset, indices)
+    return [dataset[index] for index in indices]
 
 
-def _as_it_is(batch: list[PackedBatch], *, collate_fn_map: Any = None) -> PackedBatch:
-    return batch[0]
+def _read_at_once(batch: Sequence[Item], *, collate_fn_map: Any = None) -> Any:
+    if isinstance(batch, Together):
+        return batch.dataset.reader.get_batch(batch.indices)
+    return default_collate([dict(item) for item in batch])

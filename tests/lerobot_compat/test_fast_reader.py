@@ -16,6 +16,7 @@ from torch.utils.data import DataLoader
 
 from lerobot_vtrefine.datasets.features import STATE_KEY
 from lerobot_vtrefine.lerobot_compat import fast_reader, frame_store
+from lerobot_vtrefine.lerobot_compat.packed_batch import PackedBatch
 
 COLOUR = "observation.images.front"
 WINDOWS = {key: [-0.1, 0.0] for key in (*RAW_KEYS, STATE_KEY)} | {"action": [i / 10 for i in range(16)]}
@@ -72,9 +73,38 @@ def test_items_are_bit_identical(tiny_dataset: Path, options: dict[str, Any]) ->
     indices = [3, 0, len(slow) - 1, 11, 12]
     (slow_batch,), (fast_batch,) = (DataLoader(data, batch_sampler=[indices]) for data in (slow, fast))
     assert_same_batch(slow_batch, fast_batch)
-    assert len(fast.__getitems__(indices)) == 1, "a whole batch, not items"
+    assert isinstance(fast_batch, PackedBatch), "read at once"
     with pytest.raises(IndexError):
-        fast.__getitems__([0, len(fast)])
+        list(DataLoader(fast, batch_sampler=[[0, len(fast)]]))
+
+
+@pytest.mark.usefixtures("stock")
+def test_a_collation_or_items_of_ones_own_are_what_they_are_without_this_package(tiny_dataset: Path) -> None:
+    """Whoever trains with another policy in the same notebook may bring their own."""
+
+    class Doubled(LeRobotDataset):
+        def __getitem__(self, index: int) -> dict[str, Any]:
+            return {**super().__getitem__(index), "twice": 2 * index}
+
+    def run() -> list[Any]:
+        dataset = LeRobotDataset("local/tiny", root=tiny_dataset, delta_timestamps=WINDOWS)
+        loaders = [DataLoader(dataset, batch_sampler=[[3, 0, 11]], collate_fn=own) for own in (list, stacked)]
+        doubled = Doubled("local/tiny", root=tiny_dataset)
+        return [batch for loader in loaders for batch in loader] + list(DataLoader(doubled, 3))[:1]
+
+    items, states, twice = run()
+    fast_reader.install()
+    fast_items, fast_states, fast_twice = run()
+    assert len(fast_items) == 3
+    for item, fast_item in zip(items, fast_items, strict=True):
+        assert_same_item(item, fast_item)
+    assert torch.equal(states, fast_states)
+    assert_same_item(twice, fast_twice)
+    assert twice["twice"].tolist() == [0, 2, 4]
+
+
+def stacked(items: list[dict[str, Any]]) -> torch.Tensor:
+    return torch.stack([item[STATE_KEY] for item in items])
 
 
 @pytest.fixture(scope="module")
