@@ -12,14 +12,21 @@ reading such a file and building its steps, in every command that loads this pac
   state files are safetensors beside the file. It is the configuration that counts and not the folder's
   ``config.json``, because who writes a checkpoint may let its files say different things.
 
-Other policies' files may go on naming processor steps in packages of their own.
+Other policies' files may go on naming processor steps in packages of their own, and tokenizers, also in a
+process that has used ``vt_dp3`` before: where LeRobot makes a policy's processors, that policy's type counts.
 """
 
+import functools
+import sys
+from collections.abc import Callable
+from contextvars import ContextVar
 from typing import Any
 
 from lerobot.processor import pipeline
 from lerobot.processor.pipeline import DataProcessorPipeline, ProcessorStep, ProcessorStepRegistry
 
+POLICY = "vt_dp3"
+FACTORY, MAKE = "lerobot.policies.factory", "make_pre_post_processors"
 OWN_PACKAGE = "lerobot_vtrefine"
 LEROBOT = "lerobot"
 OPEN_PACKAGES = ("lerobot.processor", OWN_PACKAGE)
@@ -32,6 +39,7 @@ STATE_SUFFIX = ".safetensors"
 
 _validate = DataProcessorPipeline._validate_loaded_config.__func__
 _restricted = False
+_policy: ContextVar[str | None] = ContextVar("policy whose processors LeRobot makes", default=None)
 
 
 def install() -> None:
@@ -45,14 +53,42 @@ def install() -> None:
 
 
 def restrict() -> None:
-    """Allow processor files from now on only what a checkpoint of ``vt_dp3`` may name."""
+    """Allow processor files from now on only what one of ``vt_dp3`` may name, but those that LeRobot reads to
+    make another policy's processors.
+    """
     global _restricted
     _restricted = True
+    stock = getattr(sys.modules.get(FACTORY), MAKE, None)
+    if stock is None or hasattr(stock, "__wrapped__"):
+        return
+    ours = _for_its_policy(stock)
+    for name, module in list(sys.modules.items()):
+        holds_it = vars(module).get(MAKE) is stock
+        if holds_it and (name == "__main__" or name.startswith(f"{LEROBOT}.")):
+            setattr(module, MAKE, ours)
+
+
+def _for_its_policy[**P, R](stock: Callable[P, R]) -> Callable[P, R]:
+    @functools.wraps(stock)
+    def make(*args: P.args, **kwargs: P.kwargs) -> R:
+        config: Any = args[0] if args else kwargs.get("policy_cfg")
+        outer = _policy.set(getattr(config, "type", None))
+        try:
+            return stock(*args, **kwargs)
+        finally:
+            _policy.reset(outer)
+
+    return make
+
+
+def is_restricted() -> bool:
+    """Whether a processor file that is read now may name only what one of ``vt_dp3`` may."""
+    return _restricted and _policy.get() in (None, POLICY)
 
 
 def check_steps(cls: type[DataProcessorPipeline], steps: list[dict[str, Any]], file: str) -> None:
     """Raise ValueError, naming ``file`` and the class, for the first of ``steps`` that must not be built."""
-    if _restricted:
+    if is_restricted():
         for number, step in enumerate(steps):  # all of them before the first is imported
             if reason := forbidden_entry(step):
                 raise ValueError(f"{file}: step {number} {reason}; nothing of it was run")
@@ -61,7 +97,7 @@ def check_steps(cls: type[DataProcessorPipeline], steps: list[dict[str, Any]], f
         reason = None
         if not (isinstance(step_class, type) and issubclass(step_class, ProcessorStep)):
             reason = f"names {step.get('class', name)!r}, which is not a processor step"
-        elif _restricted:
+        elif is_restricted():
             reason = forbidden_class(step_class)
         if reason is not None:
             raise ValueError(f"{file}: step {number} {reason}; nothing of it was run")

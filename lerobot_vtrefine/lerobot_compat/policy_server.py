@@ -21,9 +21,9 @@ from lerobot.utils.constants import OBS_STR
 
 from lerobot_vtrefine.lerobot_compat import arrays
 from lerobot_vtrefine.lerobot_compat.action_rates import RATE
+from lerobot_vtrefine.lerobot_compat.checkpoint_guard import POLICY
 from lerobot_vtrefine.lerobot_compat.guard import is_supported
 
-POLICY = "vt_dp3"
 WORKERS = 4
 REMEMBERED = 16
 """Observations that are kept for policies that read several frames."""

@@ -50,9 +50,12 @@ SEAMS = (
     ),
     Seam(
         "checkpoint_guard",
-        ("lerobot.processor.pipeline.DataProcessorPipeline._validate_loaded_config",),
+        (
+            "lerobot.processor.pipeline.DataProcessorPipeline._validate_loaded_config",
+            "lerobot.policies.factory.make_pre_post_processors",
+        ),
         "a checkpoint's processor file may name any Python callable, which is imported and called",
-        "the policy package, when it is imported",
+        "the policy package, when it is imported; configurations of vt_dp3, when they are made",
         "stays: it only refuses",
     ),
     Seam(

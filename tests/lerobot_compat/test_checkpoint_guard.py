@@ -3,10 +3,12 @@
 import json
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
 from lerobot.configs import FeatureType, PolicyFeature
+from lerobot.policies import factory
 from lerobot.policies.act.configuration_act import ACTConfig
 from lerobot.processor import PolicyProcessorPipeline, ProcessorStepRegistry
 from safetensors.torch import save_file
@@ -153,3 +155,28 @@ def test_other_policies_keep_their_own_steps_but_call_nothing_that_is_no_step(tm
     assert not (tmp_path / "called").exists()
     with pytest.raises(ValueError, match=r"[Tt]okenizer_?[Pp]rocessor"):  # LeRobot's own words
         load(loader)
+
+
+def test_another_policy_keeps_its_own_steps_after_one_of_ours(tmp_path, marker, monkeypatch) -> None:
+    """In a notebook, say: what LeRobot makes processors for counts, and not what was used before."""
+    monkeypatch.setattr(factory, "make_pre_post_processors", factory.make_pre_post_processors)
+    notebook = SimpleNamespace(make_pre_post_processors=factory.make_pre_post_processors)
+    monkeypatch.setitem(sys.modules, "lerobot.notebook", notebook)
+    own = checkpoint(tmp_path / "own", {"class": "steps_of_a_user.Step"})
+    ours, other = config_of_ours(), ACTConfig(device="cpu")
+    for make in (factory.make_pre_post_processors, notebook.make_pre_post_processors):
+        with pytest.raises(ValueError, match="vt_dp3 loads registered processor steps"):
+            make(ours, pretrained_path=str(own))
+        with pytest.raises(ValueError, match="vt_dp3 loads registered processor steps"):
+            make(policy_cfg=ours, pretrained_path=str(own))
+        assert not marker.exists()
+    with pytest.raises(ValueError, match="vt_dp3 loads registered processor steps"):
+        load(own)
+    assert not marker.exists()
+    for make in (factory.make_pre_post_processors, notebook.make_pre_post_processors):
+        assert type(make(other, pretrained_path=str(own))[0].steps[-1]).__name__ == "Step"
+    config_of_ours()
+    assert factory.make_pre_post_processors.__wrapped__ is notebook.make_pre_post_processors.__wrapped__
+    assert not hasattr(factory.make_pre_post_processors.__wrapped__, "__wrapped__")
+    with pytest.raises(ValueError, match="vt_dp3 loads registered processor steps"):
+        load(own)
