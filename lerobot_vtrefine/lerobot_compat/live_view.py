@@ -46,7 +46,7 @@ def drawable(observation: Observation, pads: Mapping[str, PadConfig]) -> dict[st
 
 
 def install(pads: Mapping[str, PadConfig]) -> None:
-    """Show these pads as pictures from now on; again with other pads, those are shown.
+    """Show these pads as pictures from now on, beside those of robots that were made before.
 
     On a LeRobot version that was not tested it logs a warning and leaves LeRobot as it is.
     """
@@ -55,9 +55,12 @@ def install(pads: Mapping[str, PadConfig]) -> None:
     if not is_supported() or not all(hasattr(dispatch, name) for name in LOGGERS):
         logger.warning("This LeRobot version is untested: --display_data shows pads as curves.")
         return
+    if pads in _known:
+        _known.remove(pads)
+    _known.insert(0, pads)
     for name in LOGGERS:
         original = getattr(dispatch, name)
-        setattr(dispatch, name, _drawing(getattr(original, "undrawn", original), pads))
+        setattr(dispatch, name, _drawing(getattr(original, "undrawn", original)))
 
 
 def uninstall() -> None:
@@ -67,13 +70,30 @@ def uninstall() -> None:
     for name in LOGGERS:
         current = getattr(dispatch, name)
         setattr(dispatch, name, getattr(current, "undrawn", current))
+    _known.clear()
 
 
-def _drawing(original: Callable[..., None], pads: Mapping[str, PadConfig]) -> Callable[..., None]:
+_known: list[Mapping[str, PadConfig]] = []
+"""The pads of every robot that was made, the latest first."""
+
+
+def pads_of(observation: Observation) -> Mapping[str, PadConfig] | None:
+    """Those of the robot that an observation is of; None where it is none of ours."""
+    plain = {key.removeprefix(OBS_PREFIX): value for key, value in observation.items()}
+    for pads in _known:
+        here = [(pad, f"{TACTILE}.{name}") for name, pad in pads.items() if f"{TACTILE}.{name}" in plain]
+        if here and all(np.asarray(plain[key]).size == np.prod(pad.pad_shape) for pad, key in here):
+            return pads
+    return None
+
+
+def _drawing(original: Callable[..., None]) -> Callable[..., None]:
     """LeRobot's logging function, which gets pictures."""
 
     def log(observation: Observation | None = None, **others: Any) -> None:
-        original(observation=drawable(observation, pads) if observation else observation, **others)
+        pads = pads_of(observation) if observation else None
+        shown = observation if observation is None or pads is None else drawable(observation, pads)
+        original(observation=shown, **others)
 
     log.undrawn = original  # ty: ignore[missing-attribute]
     return log

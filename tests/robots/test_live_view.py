@@ -112,6 +112,26 @@ def test_wrapping_twice_draws_once_and_is_undone(monkeypatch: pytest.MonkeyPatch
     assert dispatch.log_rerun_data is stock
 
 
+def test_robots_one_after_the_other_are_each_shown_with_their_own_pads(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A simulated one beside a real one whose pads bear the same names, and one that is none of ours."""
+    seen: list[dict[str, Any]] = []
+    monkeypatch.setattr(dispatch, "log_rerun_data", lambda observation=None, **_: seen.append(observation))
+    for rows, cols in ((2, 3), (4, 3)):
+        live_view.install({"thumb": PadConfig("/dev/a", rows=rows, cols=cols)})
+    other = {"camera.gain": 1.0, "arm.pos": 0.5, "tactile_baseline.x": 2.0}
+    for frame in (
+        {"tactile.thumb": np.zeros(6, np.uint8)},
+        {"tactile.thumb": np.zeros(12, np.uint8)},
+        {"tactile.thumb": np.zeros(5, np.uint8)},
+        other,
+    ):
+        dispatch.log_visualization_data("rerun", observation=frame)
+    assert [frame["tactile.thumb"].shape for frame in seen[:3]] == [(2, 3, 3), (4, 3, 3), (5,)]
+    assert seen[3] == other
+
+
 def test_untested_lerobot_is_left_alone(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
