@@ -187,10 +187,20 @@ def _forgetting(run: Callable[..., None]) -> Callable[..., None]:
 
 
 def _phased(loop: Callable[..., None]) -> Callable[..., None]:
-    """The loop, inside the robot's phase; LeRobot passes all of its arguments by name."""
+    """The loop, inside the robot's phase; LeRobot passes all of its arguments by name.
+
+    A script that passes another robot otherwise sees nothing of it.
+
+    Raises:
+        TypeError: a robot or a teleoperator that wants to know is not passed by name.
+    """
 
     @functools.wraps(loop)
     def run(*args: Any, **settings: Any) -> None:
+        if any(isinstance(given, PhasedRobot | FollowingTeleoperator) for given in args):
+            raise TypeError("LeRobot's loop needs its arguments by name here: robot=, teleop=, fps=, ...")
+        if "robot" not in settings:
+            return loop(*args, **settings)
         robot = getattr(settings["robot"], "inner", settings["robot"])
         with ExitStack() as stack:
             if isinstance(robot, PhasedRobot):

@@ -181,6 +181,18 @@ def test_another_robot_that_is_replayed_later_in_this_process_has_its_own_rate(r
     assert lerobot_replay.make_robot_from_config is make_robot_from_config
 
 
+def test_a_loop_of_ones_own_takes_other_robots_as_it_did() -> None:
+    sim, seen = VtRefineSim(VtRefineSimConfig(env={"start": "grasped", "num_threads": 1})), []
+
+    def loop(robot: object, events: dict, fps: int) -> None:
+        seen.append((robot, events, fps))
+
+    phases._phased(loop)("another robot", {}, 30)
+    assert seen == [("another robot", {}, 30)]
+    with pytest.raises(TypeError, match="needs its arguments by name here: robot="):
+        phases._phased(loop)(sim, {}, 30)
+
+
 def rollout_of(robot: object, fps: int = FPS, between: int = 1) -> SimpleNamespace:
     """The context of a rollout, as far as strategies without recording read it."""
     runtime = SimpleNamespace(cfg=SimpleNamespace(fps=fps, interpolation_multiplier=between))
