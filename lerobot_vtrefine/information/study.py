@@ -193,8 +193,9 @@ def study(
 
 
 def _trained(item: Senses, frames: Frames, body: str, effort: Effort, history: int, told: Told) -> Estimator:
-    torch.manual_seed(effort.seed)
-    estimator = Estimator(item, frames, body, effort.preset, effort.device, history).to(effort.device)
+    with torch.random.fork_rng():  # whose caller's own numbers go on as they were
+        torch.manual_seed(effort.seed)
+        estimator = Estimator(item, frames, body, effort.preset, effort.device, history).to(effort.device)
     label = f"{item.words}, {history} frame{'s' * (history > 1)}"
     train_estimator(
         estimator,

@@ -208,7 +208,9 @@ def test_a_study_leaves_encoders_that_policies_start_from(tmp_path: Path) -> Non
     env = VtRefineEnvConfig(start="grasped", episode_steps=3)
     effort = Effort(episodes=8, num_envs=4, steps=2, batch_size=8, history=(1,), closed_loop_episodes=4)
     effort = replace(effort, tolerance_episodes=4, clearances_m=(0.001,), networks=(POLICY, STRONG))
+    state = torch.get_rng_state()
     found = study(env, ["tactile"], effort, keep=save_keeper(tmp_path, effort))
+    assert torch.equal(torch.get_rng_state(), state)  # whoever asks goes on with numbers of their own
     assert list(found.at_clearance) == [0.001]
     assert found.at_clearance[0.001].prior != found.prior
     assert [item.success[1] for item in found.tolerated] == [4] * 12
