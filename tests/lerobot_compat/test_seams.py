@@ -154,17 +154,17 @@ def safe_recording_(folder: Path) -> None:
 
 @probe
 def action_rates_(_: Path) -> None:
-    pytest.importorskip("grpc")
-    from lerobot.async_inference import robot_client
     from lerobot.rollout import context
     from lerobot.scripts import lerobot_rollout, lerobot_train
 
     assert "fps" not in inspect.getsource(lerobot_train)
     assert "build_rollout_context(cfg" in inspect.getsource(lerobot_rollout)
     assert not re.search(r"polic\S*fps", inspect.getsource(context))
-    assert "policy_config = RemotePolicyConfig(" in inspect.getsource(robot_client)
-    assert "fps" not in inspect.getsource(robot_client.RobotClient.start)
-    assert "fps" not in inspect.getsource(robot_client.RemotePolicyConfig)
+    client = (Path(import_utils.__file__).parents[1] / "async_inference" / "robot_client.py").read_text()
+    assert "self.stub.SendPolicyInstructions(policy_setup)" in client  # which holds no rate:
+    policy = client.partition("self.policy_config = RemotePolicyConfig(")[2].partition("self.channel")[0]
+    assert "config.policy_type" in policy
+    assert "fps" not in policy
 
 
 def small_dataset(folder: Path) -> LeRobotDataset:
@@ -183,8 +183,11 @@ def test_lerobot_still_needs_it(seam: object, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("seam", SEAMS, ids=lambda seam: seam.module)
-def test_what_it_changes_is_there(seam: object) -> None:
+def test_what_it_changes_is_there(seam: object, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)  # LeRobot's asynchronous inference makes a folder logs/ where it is imported
     for path in seam.changes:
+        if "async_inference" in path:
+            pytest.importorskip("grpc")
         owner, name = path.rsplit(".", 1)
         assert hasattr(pkgutil.resolve_name(owner), name), path
 
