@@ -41,11 +41,15 @@ POSES = {
 
 @functools.cache
 def start_warp() -> None:
-    """Initialise warp without its banner and without its complaint about a missing CUDA driver."""
+    """Initialise warp without its banner and without its complaint about a missing CUDA driver.
+
+    It is as quiet from then on, unless its level is another than warp's default.
+    """
+    level = wp.config.log_level
     wp.config.log_level = wp.LOG_ERROR
     with contextlib.nullcontext() if _has_cuda_driver() else _silent_native_stderr():
         wp.init()
-    wp.config.log_level = wp.LOG_WARNING
+    wp.config.log_level = wp.LOG_WARNING if level == wp.LOG_INFO else level
 
 
 def _has_cuda_driver() -> bool:

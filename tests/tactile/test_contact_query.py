@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import warp as wp
 from touch_shapes import (
     box_mesh,
     closest_distance,
@@ -15,7 +16,7 @@ from touch_shapes import (
 )
 
 from lerobot_vtrefine.tactile import BodyGeometry, Box, ConvexHull, Cylinder, PadLayout, Sphere, TriangleMesh
-from lerobot_vtrefine.tactile.contact_query import REACH_M, ContactQuery
+from lerobot_vtrefine.tactile.contact_query import REACH_M, ContactQuery, start_warp
 from lerobot_vtrefine.tactile.geometry import Primitive
 
 LAYOUT = PadLayout(6, 12, 0.002)
@@ -221,3 +222,14 @@ def test_an_inside_out_mesh_is_turned() -> None:
     query = ContactQuery(LAYOUT, [BodyGeometry([TriangleMesh(vertices, faces[:, ::-1])])])
     depth, _ = single_query(query, "column", np.array([[0, 0, 0.0098]]), np.eye(3)[None])
     assert np.isclose(depth.max(), 2e-4, atol=1e-7)
+
+
+def test_warp_stays_as_talkative_as_its_user_made_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    for chosen, then in (
+        (wp.LOG_DEBUG, wp.LOG_DEBUG),
+        (wp.LOG_ERROR, wp.LOG_ERROR),
+        (wp.LOG_INFO, wp.LOG_WARNING),
+    ):
+        monkeypatch.setattr(wp.config, "log_level", chosen)
+        start_warp.__wrapped__()
+        assert wp.config.log_level == then
