@@ -5,6 +5,7 @@ the same, and stay.
 """
 
 import logging
+from weakref import WeakSet
 
 from lerobot.utils import keyboard_input
 
@@ -15,20 +16,24 @@ logger = logging.getLogger(__name__)
 NAMES = ("left", "right")
 
 
-def install() -> None:
-    """LeRobot's key listeners no longer hear the left and the right arrow."""
+def install(owner: object) -> None:
+    """LeRobot's key listeners no longer hear the left and the right arrow, while they drive ``owner``."""
     if not is_supported():
         logger.warning("this LeRobot may take the arrow keys for itself: use --teleop.input=keyboard")
         return
+    _owners.add(owner)
     known = keyboard_input._PYNPUT_KEY_NAMES
     for key in [key for key, name in known.items() if name in NAMES]:
         _unheard[key] = known.pop(key)
 
 
-def uninstall() -> None:
-    """They hear them again."""
-    keyboard_input._PYNPUT_KEY_NAMES.update(_unheard)
-    _unheard.clear()
+def uninstall(owner: object) -> None:
+    """They hear them again, once nobody else drives a hand by them."""
+    _owners.discard(owner)
+    if not _owners:
+        keyboard_input._PYNPUT_KEY_NAMES.update(_unheard)
+        _unheard.clear()
 
 
+_owners: WeakSet[object] = WeakSet()
 _unheard: dict[object, str] = {}

@@ -142,6 +142,7 @@ def test_lerobot_record_leaves_the_arrows_to_a_keyboard_that_drives_a_hand(
     assert heard == ["left", "right", "esc"]
     devices = LeRobotDevices({"left": {"type": "keyboard_ee"}}, FPS, speed_m_s=0.1)
     devices.connect()
+    LeRobotDevices({"left": {"type": "keyboard_ee"}}, FPS, speed_m_s=0.1).disconnect()  # none of its business
     heard = [keyboard_input._resolve_pynput_key(key) for key in names]
     devices.disconnect()
     assert heard == [None, None, "esc"]

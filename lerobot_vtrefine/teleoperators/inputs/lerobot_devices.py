@@ -58,7 +58,7 @@ class LeRobotDevices:
                     f"--teleop.devices: the {device.name} for the {arm} hand cannot be read here"
                 )
             if isinstance(device, keyboard.KeyboardEndEffectorTeleop):
-                arrow_keys.install()
+                arrow_keys.install(self)
 
     def restart(self, grips: Mapping[str, float]) -> None:
         """The devices are at rest, and the hands closed as they are."""
@@ -81,7 +81,7 @@ class LeRobotDevices:
 
     def disconnect(self) -> None:
         """Close all of them."""
-        arrow_keys.uninstall()
+        arrow_keys.uninstall(self)
         for device in self._devices.values():
             if device.is_connected:
                 device.disconnect()
