@@ -1,3 +1,4 @@
+import multiprocessing
 import sys
 from pathlib import Path
 
@@ -20,6 +21,17 @@ def fake_commands(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         return str(script)
 
     monkeypatch.setattr(stages, "find_command", find)
+
+
+@pytest.fixture
+def started_quickly(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Processes that this one starts are copies of one that has imported LeRobot, seconds each otherwise.
+
+    What they are given is pickled, and this package imported, as in processes that begin with nothing.
+    """
+    copies = multiprocessing.get_context("forkserver")
+    copies.set_forkserver_preload(["lerobot.envs"])
+    monkeypatch.setattr(multiprocessing, "get_context", lambda method=None: copies)
 
 
 @pytest.fixture(scope="session")

@@ -50,6 +50,7 @@ VECTORISATIONS = {
 }
 
 
+@pytest.mark.usefixtures("started_quickly")
 def test_lerobot_eval_plays_the_same_episodes_in_every_vectorisation(evaluate, tmp_path):
     played = {}
     for name, flags in VECTORISATIONS.items():

@@ -54,6 +54,7 @@ def test_dataset_holds_successful_raw_episodes(demos: Path):
     assert 0.1 < float(item[DEPTH_KEY].max()) / 1000 < 2
 
 
+@pytest.mark.usefixtures("started_quickly")
 def test_more_workers_give_the_same_dataset(demos: Path, tmp_path: Path):
     again = tmp_path / "workers"
     assert record(again, "--num_episodes=3", "--num_envs=1", "--num_workers=2", "--seed=5") == 0
@@ -109,6 +110,7 @@ def test_an_interrupt_says_what_is_left(saved, told, tmp_path, monkeypatch, caps
     assert (tmp_path / "demos").exists() == (saved > 0)
 
 
+@pytest.mark.usefixtures("started_quickly")
 def test_there_is_one_worker_for_each_core_at_most(monkeypatch):
     monkeypatch.setattr(os, "cpu_count", lambda: 1)
     with demonstration_stream(VtRefineEnvConfig(), Degradation(), 1, 5, num_workers=500):
