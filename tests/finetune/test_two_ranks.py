@@ -1,4 +1,4 @@
-"""Two CPU processes, as torchrun starts them: the update equals one process with all the data; each owns its seeds."""
+"""Two CPU ranks, as torchrun starts them: the update equals one process with all the data; each owns its seeds."""
 
 import json
 import multiprocessing
