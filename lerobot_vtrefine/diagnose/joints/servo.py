@@ -186,23 +186,34 @@ def _linear(time_s: Array, target: Array, start: Array, columns: Columns) -> Arr
     dt = np.diff(time_s, axis=0)
     unique, inverse = np.unique(dt.round(_DT_DIGITS), return_inverse=True)
     inverse = inverse.reshape(dt.shape)
-    a11, a12, a21, a22 = transition(unique[:, None], columns.omega, columns.zeta)
+    alike = (inverse[1:] == inverse[:-1]).all(axis=1)
+    # Factors of a step stand together, as position and speed do (2, T, C): operations on so few numbers
+    # cost more to begin than to do.
+    factors = np.stack(transition(unique[:, None], columns.omega, columns.zeta))
+    factors = factors.reshape(2, 2, *factors.shape[1:])
     low_pass = _low_pass(unique[:, None], columns)
+    fading = None if low_pass is None else np.stack(low_pass)
     held, extra = _arrivals(time_s, target, columns)
     out = np.empty_like(target)
-    q, v, smooth = start, np.zeros_like(start), target[0]
-    out[0] = q
+    state, smooth = np.stack([start, np.zeros_like(start)]), target[0]
+    out[0] = start
     for k in range(len(dt)):
-        step = inverse[k]
-        error = q - held[k]
-        q, v = held[k] + a11[step] * error + a12[step] * v, a21[step] * error + a22[step] * v
-        if low_pass is not None:
-            behind = smooth - held[k]
-            q, v = q + low_pass[0][step] * behind, v + low_pass[1][step] * behind
-            smooth = held[k] + low_pass[2][step] * behind
+        if k == 0 or not alike[k - 1]:
+            factor = factors.take(inverse[k], axis=2)
+            fade = None if fading is None else fading.take(inverse[k], axis=1)
+        now = held[k]
+        state[0] -= now
+        parts = factor * state
+        parts[0, 0] += now
+        state = parts[:, 0] + parts[:, 1]
+        if fade is not None:
+            gone = fade * (smooth - now)
+            state += gone[:2]
+            smooth = now + gone[2]
         if extra is not None:
-            q, v, smooth = q + extra[0][k], v + extra[1][k], smooth + extra[2][k]
-        out[k + 1] = q
+            state += extra[:2, k]
+            smooth = smooth if fade is None else smooth + extra[2, k]
+        out[k + 1] = state[0]
     return out
 
 
@@ -222,7 +233,7 @@ def _low_pass(h: Array, columns: Columns) -> tuple[Array, Array, Array] | None:
 
 def _arrivals(time_s: Array, target: Array, columns: Columns) -> tuple[Array, Array | None]:
     """Target in force at the start of every interval (N-1, T, C), and what later arrivals add by its end to
-    the position, the speed and the low-pass (3, N-1, T, C)."""
+    the position, the speed and the low-pass, if there is one (2 or 3, N-1, T, C)."""
     if columns.tau_s <= 0:
         return target[:-1], None
     count, trials = time_s.shape
@@ -240,10 +251,11 @@ def _arrivals(time_s: Array, target: Array, columns: Columns) -> tuple[Array, Ar
     rest = time_s[row + 1, trial] - arrival[where + 1, trial]
     unique, inverse = np.unique(rest.round(_DT_DIGITS), return_inverse=True)
     b11, _, b21, _ = transition(unique[:, None], columns.omega, columns.zeta)
-    b13, b23, fade = _low_pass(unique[:, None], columns) or (0.0, 0.0, np.ones_like(b11))
+    b13, b23, fade = _low_pass(unique[:, None], columns) or (0.0, 0.0, None)
     change = target[where + 1, trial] - target[where, trial]
-    extra = np.zeros((3, count - 1, *target.shape[1:]))
-    for place, added in enumerate((1 - b11 - b13, -b21 - b23, 1 - fade)):
+    changes = (1 - b11 - b13, -b21 - b23, *(() if fade is None else (1 - fade,)))
+    extra = np.zeros((len(changes), count - 1, *target.shape[1:]))
+    for place, added in enumerate(changes):
         _add(extra[place], row, trial, added[inverse] * change)
     arrived = (arrival[1:] + lane).T.ravel()
     # Arrivals up to and at the interval's start are in force there.
