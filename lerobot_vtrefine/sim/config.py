@@ -282,7 +282,7 @@ class WarpConfig:
     solver: str = "own"
     """own (this package's order of kernels and constraint solver), or stock (mujoco_warp's own step)."""
     graph: bool = True
-    """Record a substep as a CUDA graph, where the GPU and its driver can."""
+    """Record a substep as a graph, where the device and its driver can."""
 
     def __post_init__(self) -> None:
         if not re.fullmatch(r"auto|cpu|cuda(:\d+)?", self.device):

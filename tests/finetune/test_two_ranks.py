@@ -1,4 +1,7 @@
-"""Two CPU ranks, as torchrun starts them: the update equals one process with all the data; each owns its seeds."""
+"""Two CPU ranks, as torchrun starts them: their update is that of one process with all the data.
+
+Each owns its seeds.
+"""
 
 import json
 import multiprocessing

@@ -253,6 +253,7 @@ def test_a_world_without_room_for_its_collision_fails_alone(pair, monkeypatch):
     warp.reset(EVERYONE, EVERYONE)
     warp._backend.write(np.array([1]), *single._backend.read(np.array([1])))
     monkeypatch.setattr(collision_convex, "MJ_MAX_EPAHORIZON", 3)
+    monkeypatch.setattr(warp._backend.worlds, "_capture", False)  # what was recorded has the room of before
     result = warp.step(warp.command_targets())
     np.testing.assert_array_equal(result.terminated, [False, True, False])
     assert not result.success.any()
@@ -314,12 +315,27 @@ def test_what_a_world_that_blew_up_leaves_behind_is_finite(pair, monkeypatch):
             worlds.qvel[1], worlds.qpos[1], worlds.sensors[1] = [float("nan")] * 3
 
     monkeypatch.setattr(worlds, "step", step)
+    monkeypatch.setattr(worlds, "_capture", False)  # a recording would not come by here
     result = warp.step(warp.command_targets())
     np.testing.assert_array_equal(result.terminated, [False, True, False])
     assert FAILURES[warp.metrics()["failure"][1]] == "unstable"
     assert np.isfinite(warp.privileged()).all()
     assert np.isfinite(warp.metrics()["peak_force_n"]).all()
     assert all(np.isfinite(values).all() for values in warp._episode.row(1).values())
+
+
+def test_substeps_are_the_same_whether_they_are_recorded_or_launched(pair, monkeypatch):
+    warp, _ = pair
+    worlds, found = warp._backend.worlds, []
+    for recorded in (True, False):
+        monkeypatch.setattr(worlds, "_capture", recorded)
+        warp.reset(EVERYONE, EVERYONE)
+        for _ in range(3):
+            warp.step(warp.command_targets())
+        found.append([*warp._backend.read(EVERYONE), warp.observe()["tactile"]])
+    assert ("substep", 1) in worlds._recorded
+    for left, right in zip(*found, strict=True):
+        np.testing.assert_array_equal(left, right)
 
 
 @pytest.mark.gpu

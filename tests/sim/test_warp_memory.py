@@ -43,7 +43,7 @@ def test_recordings_share_the_arena_of_the_largest(device):
 
 
 def test_work_is_done_once_and_recorded_in_the_arena_that_is_there(device, monkeypatch):
-    """Warp takes allocators and captures on GPUs only: here the allocators are asked by hand."""
+    """As on a GPU, with allocators that are asked by hand."""
     asked, waits, given = [], [], []
 
     def allocator(_, one):
@@ -51,7 +51,7 @@ def test_work_is_done_once_and_recorded_in_the_arena_that_is_there(device, monke
         return nullcontext()
 
     pool = SimpleNamespace(allocate=lambda size: 0, deallocate=lambda *_: None)
-    gpu = SimpleNamespace(get_allocator=lambda: pool)
+    gpu = SimpleNamespace(get_allocator=lambda: pool, is_cuda=True)
     monkeypatch.setattr(warp_memory, "Arena", lambda size, _: Arena(size, device))
     monkeypatch.setattr(wp, "ScopedAllocator", allocator)
     monkeypatch.setattr(wp, "ScopedCapture", lambda *_, **__: nullcontext(SimpleNamespace(graph="graph")))

@@ -1,10 +1,12 @@
-"""Memory for the temporary arrays of work that is recorded as a CUDA graph. Imports warp.
+"""Memory for the temporary arrays of work that is recorded as a graph. Imports warp.
 
 Arrays from CUDA's pool would put a node for every allocation and every release into the graph, some seventy
-in a physics step, each of which takes its turn; an arena is one block that exists beforehand.
+in a physics step, each of which takes its turn; an arena is one block that exists beforehand. A CPU's arrays
+would be gone by the time that the work is done again.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Generator
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import warp as wp
@@ -90,6 +92,20 @@ def arena_of(size: int, device: wp.Device, there: Arena | None) -> Arena:
     return there if there is not None and there.size >= size else Arena(size, device)
 
 
+@contextmanager
+def allocating(device: wp.Device, allocator: Tally | Arena) -> Generator[None]:
+    """`warp.ScopedAllocator`, which refuses CPUs. No other thread may use Warp on the device meanwhile."""
+    if device.is_cuda:
+        with wp.ScopedAllocator(device, allocator):
+            yield
+        return
+    before, device.default_allocator = device.default_allocator, allocator
+    try:
+        yield
+    finally:
+        device.default_allocator = before
+
+
 def record(work: Callable[[], None], times: int, device: wp.Device, there: Arena | None = None) -> Recording:
     """Do some work so many times, and record that. Its temporary arrays must not outlive one time.
 
@@ -101,7 +117,7 @@ def record(work: Callable[[], None], times: int, device: wp.Device, there: Arena
             the same time; it is used again where it is large enough.
     """
     tally = Tally(device)
-    with wp.ScopedAllocator(device, tally):
+    with allocating(device, tally):
         for _ in range(times):
             tally.rewind()
             work()
@@ -109,7 +125,7 @@ def record(work: Callable[[], None], times: int, device: wp.Device, there: Arena
             wp.synchronize_device(device)
     arena = arena_of(tally.most, device, there)
     # Every kernel is loaded by now, which could not happen during the capture.
-    with wp.ScopedAllocator(device, arena), wp.ScopedCapture(device, force_module_load=False) as capture:
+    with allocating(device, arena), wp.ScopedCapture(device, force_module_load=False) as capture:
         for _ in range(times):
             arena.rewind()
             work()

@@ -161,7 +161,8 @@ class WarpWorlds:
             for _ in range(times):
                 work()
             return
-        for count in [LONGEST] * (times // LONGEST) + [times % LONGEST]:
+        longest = LONGEST if wp.get_device(self.device).is_cuda else 1
+        for count in [longest] * (times // longest) + [times % longest]:
             if (what, count) in self._recorded:
                 self._recorded[what, count].launch()
             elif count:
@@ -280,5 +281,5 @@ def _make_room_for_edges(iterations: int) -> None:
 
 
 def _can_capture(device: str) -> bool:
-    """Whether substeps can become a CUDA graph: allocations inside one need the memory pool."""
-    return wp.get_device(device).is_cuda and wp.is_mempool_enabled(device)
+    """Whether substeps can become a graph: allocations inside one of CUDA's need the memory pool."""
+    return not wp.get_device(device).is_cuda or wp.is_mempool_enabled(device)
