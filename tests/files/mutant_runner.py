@@ -12,8 +12,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-SECONDS = 20.0
-"""A command that takes longer hangs; the slowest sound one takes three on a busy machine."""
+SECONDS = 20
+"""Of processor time: a command that takes more hangs. The slowest sound one takes two."""
+WAITED = 3
+"""How many times as long a command may take by the clock, beside others on the machine, or asleep."""
 MEMORY_BYTES = 1 << 30
 """What a command may take beyond the interpreter with everything imported."""
 FLOOD_BYTES = 20_000
@@ -40,21 +42,21 @@ class Outcome:
         return self.ending in ("accepted", "refused")
 
 
-def run_limited(action: Callable[[], int | None], scratch: Path, seconds: float = SECONDS) -> Outcome:
+def run_limited(action: Callable[[], int | None], scratch: Path, seconds: int = SECONDS) -> Outcome:
     """Fork, run the command there, wait. Fork after all imports, so that this takes milliseconds."""
     log, note = scratch / "output.txt", scratch / "resident.txt"
     started = time.monotonic()
     child = os.fork()
     if child == 0:
-        _run_child(action, log, note)
-    status, usage, hung = _wait(child, started + seconds)
+        _run_child(action, log, note, seconds)
+    status, usage, hung = _wait(child, started + WAITED * seconds)
     taken = time.monotonic() - started
     text = log.read_text(encoding="utf-8", errors="replace") if log.is_file() else ""
     grown = max(0, usage.ru_maxrss * 1024 - int(note.read_text(encoding="ascii")))
     return Outcome(_ending(status, hung, text, grown), text[-3000:], taken, grown)
 
 
-def _run_child(action: Callable[[], int | None], log: Path, note: Path) -> None:
+def _run_child(action: Callable[[], int | None], log: Path, note: Path, seconds: int) -> None:
     """In the child: never returns."""
     status = DEFECT
     try:
@@ -68,6 +70,7 @@ def _run_child(action: Callable[[], int | None], log: Path, note: Path) -> None:
         limit = _data_bytes() + 2 * MEMORY_BYTES  # a net: what counts is the memory that is resident
         resource.setrlimit(resource.RLIMIT_DATA, (limit, limit))
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+        resource.setrlimit(resource.RLIMIT_CPU, (seconds, 2 * seconds))
         note.write_text(str(_resident_bytes()), encoding="ascii")
         status = action() or 0
     except SystemExit as leaving:
@@ -94,7 +97,7 @@ def _wait(child: int, until_s: float) -> tuple[int, resource.struct_rusage, bool
 
 
 def _ending(status: int, hung: bool, text: str, grown: int) -> str:
-    if hung:
+    if hung or (os.WIFSIGNALED(status) and os.WTERMSIG(status) == signal.SIGXCPU):
         return "hang"
     if "MemoryError" in text or grown > MEMORY_BYTES:
         return "memory"

@@ -51,7 +51,7 @@ def report(kind: Kind, found: list[tuple[str, Outcome]]) -> str:
 def test_the_sound_file_is_accepted(kind: Kind, tmp_path: Path) -> None:
     assert kind.sound is not None
     kind.sound(tmp_path)
-    outcome = run_limited(lambda: kind.command(tmp_path), tmp_path, 60.0)
+    outcome = run_limited(lambda: kind.command(tmp_path), tmp_path, 60)
     assert outcome.ending == "accepted", outcome.text
 
 
