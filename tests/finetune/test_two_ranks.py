@@ -1,48 +1,37 @@
-"""Two CPU ranks, as torchrun starts them: their update is that of one process with all the data.
-
-Each owns its seeds.
-"""
+"""Two CPU processes under torchrun: the update equals one process with all the data; each owns its seeds."""
 
 import json
-import multiprocessing
+import os
+import subprocess
+import sys
+from pathlib import Path
 
 import pytest
 import torch
 from tiny_policy import save_tiny_checkpoint
-from torch.distributed.launcher.api import LaunchConfig, elastic_launch
-from two_ranks import main
 
 from lerobot_vtrefine.finetune.distributed import claim_gpu
 from lerobot_vtrefine.finetune.logger import read_progress
 
 
-def launch(*arguments: object) -> None:
-    """Start two ranks as torchrun does, but as copies of this process, and wait for them."""
-    agent = LaunchConfig(
-        min_nodes=1,
-        max_nodes=1,
-        nproc_per_node=2,
-        rdzv_backend="c10d",
-        rdzv_endpoint="localhost:0",
-        max_restarts=0,
-        start_method="fork",
-    )
-    elastic_launch(agent, main)(*arguments)
-
-
 @pytest.fixture(scope="module")
 def ranks(tmp_path_factory):
-    """What each of two ranks found; and the run's folder.
-
-    To import LeRobot in every rank would take most of the time; the command `torchrun` itself starts those of
-    cli/test_finetune_ranks.py. Its agent takes over signals, and so is a process of its own.
-    """
+    """What each of two ranks found; and the run's folder."""
     folder = tmp_path_factory.mktemp("ranks")
     checkpoint = save_tiny_checkpoint(folder / "start")
-    agent = multiprocessing.get_context("fork").Process(target=launch, args=(folder, checkpoint))
-    agent.start()
-    agent.join()
-    assert agent.exitcode == 0
+    script = Path(__file__).with_name("two_ranks.py")
+    command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc_per_node=2"]
+    path = os.pathsep.join([str(script.parent), os.environ.get("PYTHONPATH", "")]).rstrip(os.pathsep)
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": path}
+    done = subprocess.run(
+        [*command, str(script), str(folder), str(checkpoint)],
+        env=environment,
+        cwd=folder,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr[-3000:]
     return [json.loads((folder / f"rank{rank}.json").read_text()) for rank in range(2)], folder / "run"
 
 

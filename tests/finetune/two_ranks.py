@@ -1,5 +1,6 @@
-"""What each of two ranks runs; each rank writes what it found to the folder it is given."""
+"""What the two-process test runs under torchrun; each rank writes what it found to the folder it is given."""
 
+import gc
 import json
 import sys
 from pathlib import Path
@@ -87,3 +88,8 @@ def main(folder: Path, checkpoint: Path) -> None:
     pipeline.run(cfg)
     found["seeds"] = seeds
     (folder / f"rank{rank}.json").write_text(json.dumps(found))
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]), Path(sys.argv[2]))
+    gc.freeze()  # what was imported need not be looked through once more
