@@ -74,7 +74,8 @@ def test_pads_file_names_usb_sockets(tmp_path: Path, monkeypatch: pytest.MonkeyP
     with emulated(dev, "ttyUSB0", source=source) as board, redirect_stdout(operator):
         (by_path / "pci-usb-0:2:1.0").symlink_to(board.port)
         for chosen in ([], ["--ports", board.port]):
-            assert find_pads([*chosen, "--names", "thumb", "--output", str(output)]) == 0, operator.getvalue()
+            command = [*chosen, "--names", "thumb", "--output", str(output), "--overwrite"]
+            assert find_pads(command) == 0, operator.getvalue()
             assert load_pads(output) == {"thumb": PadConfig(str(by_path / "pci-usb-0:2:1.0"))}
 
 
