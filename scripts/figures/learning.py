@@ -31,7 +31,7 @@ POLICIES = {"visuo_tactile": BLUE, "visual": ORANGE}
 LEARNED = {
     "cross_gentle": "needs touch: cross, 5 N",
     "cross_gentle_twin": "its twin needs none",
-    "d_occluded": "needs touch: hidden D",
+    "d_occluded_2048": "needs touch: hidden D",
     "cross_limited_1000": "needs touch: told limit",
     "square_1mm_slip": "square, 1 mm",
 }

@@ -23,6 +23,7 @@ LABELS = {
     "cross_gentle_twin": "its twin: parts lie as expected (cross_gentle_twin)",
     "cross_gentle_tuned": "cross_gentle, DPPO in the simulator named, all before it in the plain one",
     "d_occluded": "D shape, hidden by the hands, 5 N at most (d_occluded)",
+    "d_occluded_2048": "d_occluded, 2048 worlds, 60 iterations in smaller steps, falls undone",
     "d_occluded_twin": "its twin: parts lie as expected (d_occluded_twin)",
     "cross_limited": "cross, 2 mm, a limit of 1.5 to 10 N that is told (cross_limited)",
     "cross_limited_1000": "cross_limited, 1000 demonstrations, 30 iterations in smaller steps",
