@@ -37,7 +37,7 @@ def look(xml, sensor, seeds=(0,), steps=0, device="cpu", camera=CAMERA):
     count = len(moments)
     poses = data.geom_xpos[None].repeat(count, 0), data.geom_xmat.reshape(1, -1, 3, 3).repeat(count, 0)
     eye = DepthCamera(model, camera, count, device, sensor=sensor)
-    return eye.start_mm(np.arange(count), *poses, moments)().numpy().astype(int)
+    return eye.start_mm(np.arange(count), *poses, moments)().numpy(force=True).astype(int)
 
 
 def only(sensor, **kept):
