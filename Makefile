@@ -44,7 +44,7 @@ bench-diagnose: setup ## vtrefine-diagnose on recordings with known causes: the 
 	@$(VENV)/python scripts/bench_diagnose.py $(ARGS)
 
 docs: setup ## the documentation as a site, links checked strictly: outputs/site/index.html
-	@NO_MKDOCS_2_WARNING=1 $(VENV)/mkdocs build --quiet --strict
+	@NO_MKDOCS_2_WARNING=1 $(VENV)/mkdocs build --strict
 
 docs-serve: setup ## the same, served while you write
 	@NO_MKDOCS_2_WARNING=1 $(VENV)/mkdocs serve
