@@ -1,6 +1,7 @@
 """What a command line shows to be wrong before anything heavy is imported: flags, files and folders."""
 
 import errno
+import importlib.util
 import os
 from collections.abc import Sequence
 from pathlib import Path
@@ -19,6 +20,8 @@ BESIDE = ("config_path", "quick")
 PATHS = (CONFIG_FLAG, "--policy.path")
 """Flags whose value is a file or a folder, or a name on the Hub."""
 FOLDERS = ("--dataset.root",)
+PLUGINS = ("--env.discover_packages_path", "--policy.discover_packages_path")
+"""Flags of LeRobot's whose value is a package that it imports first."""
 RESULTS = "--output_dir"
 """Folder that a command writes."""
 
@@ -32,6 +35,7 @@ def check_arguments(flags: Sequence[Flag], arguments: Sequence[str]) -> None:
     """
     _check_known(flags, arguments)
     _check_places(arguments)
+    _check_plugins(arguments)
     _check_required(flags, arguments)
 
 
@@ -66,6 +70,21 @@ def _check_places(arguments: Sequence[str]) -> None:
     for given in map(Path, values_of(RESULTS, arguments)):
         if given.is_file():
             raise NotADirectoryError(f"{RESULTS}={given} is a file; name a folder")
+
+
+def _check_plugins(arguments: Sequence[str]) -> None:
+    """LeRobot wants packages, and ends with a traceback where one is missing or a single file."""
+    for flag in PLUGINS:
+        for given in values_of(flag, arguments):
+            try:
+                found = importlib.util.find_spec(given)
+            except (ImportError, ValueError):  # a part before a dot is missing, or it is a path
+                found = None
+            if found is None:
+                advice = "put the folder that holds it on PYTHONPATH"
+                raise ValueError(f"{flag}={given}: Python finds no such package; {advice}")
+            if found.submodule_search_locations is None:
+                raise ValueError(f"{flag}={given} is a single file; make it a folder with an __init__.py")
 
 
 def _check_required(flags: Sequence[Flag], arguments: Sequence[str]) -> None:

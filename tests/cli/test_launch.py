@@ -188,6 +188,23 @@ def test_what_is_wrong_with_a_command_line_is_told_before_lerobot_is_loaded(
     assert capsys.readouterr().err == f"error: {line}\n"
 
 
+def test_a_package_to_import_first_is_looked_for_before_lerobot_is_loaded(monkeypatch, tmp_path) -> None:
+    flags = flags_of("lerobot_vtrefine.cli.play", "PlayConfig", unused=True)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    (tmp_path / "single_file_body.py").write_text("")
+    (tmp_path / "packaged_body").mkdir()
+    (tmp_path / "packaged_body" / "__init__.py").write_text("raise RuntimeError('imported too early')")
+    for flag in ("--env.discover_packages_path", "--policy.discover_packages_path"):
+        for missing in ("no_such_body", "no_such.body", "./packaged_body", ""):
+            with pytest.raises(
+                ValueError, match=f"^{flag}={missing}: Python finds no such package; .*PYTHONPATH"
+            ):
+                check_arguments(flags, [f"{flag}={missing}"])
+        with pytest.raises(ValueError, match=f"^{flag}=single_file_body is a single file; .*__init__.py"):
+            check_arguments(flags, [f"{flag}=single_file_body"])
+        check_arguments(flags, [f"{flag}=packaged_body"])
+
+
 @pytest.mark.parametrize("below", ["pretrained_model", "checkpoints/last/pretrained_model"])
 def test_the_folder_of_a_checkpoint_or_of_a_run_is_told_where_its_policy_is(below, tmp_path: Path) -> None:
     inside = tmp_path / below
