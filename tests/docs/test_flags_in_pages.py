@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 from command_uses import uses
 
+from lerobot_vtrefine.cli.checks import PLUGINS
 from lerobot_vtrefine.cli.flags import flags_of
 
 ROOT = Path(__file__).parents[2]
@@ -22,7 +23,7 @@ SHARED = (
     ("lerobot_vtrefine.sim.demonstrations", "Degradation", "degradation."),
 )
 """Configurations whose fields commands take, and do not list."""
-ALWAYS = {"--help", "--env.type"}
+ALWAYS = {"--help", "--env.type", *PLUGINS}
 COMMAND = r"(vtrefine(?:-[a-z-]+)?)"
 
 
