@@ -1,4 +1,4 @@
-"""Pictures of what was learnt, from results/ and docs/step_size_curves.csv."""
+"""Pictures of what was learnt, from results/."""
 
 import csv
 from typing import Any
@@ -16,7 +16,7 @@ CURVES = {
     "round pair": {"R.c8.k12": "12 to 3 nats per decision", "R.g4.k24": "24 to 3"},
     "square pair, 1 mm, more slip": {"B.g8.k12": "12 to 3", "B.g8.k40": "40 to 2"},
 }
-"""Learning curves that show what the size of a step does, by their names in docs/step_size_curves.csv."""
+"""Learning curves that show what the size of a step does, by their names in results/step_size_curves.csv."""
 LIMITED = "rate limited to 2e-4"
 LIMITS = {
     "limited to 2e-4": (
@@ -52,7 +52,7 @@ TASKS = {
 
 def draw_dppo(plt: Any) -> None:
     """Success over iterations, at three step sizes."""
-    with (ROOT / "docs" / "step_size_curves.csv").open(encoding="utf-8") as file:
+    with (ROOT / "results" / "step_size_curves.csv").open(encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
     figure, axes = plt.subplots(1, 2, figsize=(8.8, 3.2), sharey=True, layout="constrained")
     for ax, (title, runs) in zip(axes, CURVES.items(), strict=True):

@@ -53,6 +53,11 @@ def test_links_of_pages_outside_the_site_lead_somewhere() -> None:
     assert missing == []
 
 
+def test_docs_holds_pages_and_folders_alone() -> None:
+    """Pictures lie in docs/img/, data in results/."""
+    assert [path.name for path in DOCS.iterdir() if path.is_file() and path.suffix != ".md"] == []
+
+
 def test_configurations_that_pages_name_exist() -> None:
     named = {
         name for page in PAGES for name in re.findall(rf"{PREFIX}(\w+)", page.read_text(encoding="utf-8"))
