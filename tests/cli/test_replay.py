@@ -75,6 +75,14 @@ def test_another_sensor_model_shows(demos: Path, tmp_path: Path) -> None:
     assert len(comparison.pairs) == 1
     assert all(pad.identical_frames == 0 for pad in comparison.touch)
     assert max(row.peak for row in comparison.tracking) == 0.0  # the motion is the same
+    assert comparison.remarks == []
+
+
+def test_a_twin_of_another_task_is_told(demos: Path, tmp_path: Path) -> None:
+    env = VtRefineEnvConfig(sensor_model="paper")  # of a dataset that starts in hand, with square parts
+    remarks = replay(ReplayConfig(tmp_path / "out", SourceConfig(demos), episodes=[1], env=env)).remarks
+    told = "the twin has --env.pair=round, --env.start=table; for the task that was recorded add"
+    assert f"{told} --env.pair=square --env.start=grasped" in remarks
 
 
 def test_tracking_alone(joints_only: Path, tmp_path: Path) -> None:

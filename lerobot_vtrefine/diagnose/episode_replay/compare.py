@@ -22,7 +22,12 @@ from lerobot_vtrefine.diagnose.episode_replay.reach import (
 )
 from lerobot_vtrefine.diagnose.episode_replay.touch import PadTouch, compare_pad
 from lerobot_vtrefine.diagnose.episode_replay.tracking import JointTracking, joint_tracking
-from lerobot_vtrefine.diagnose.episode_replay.twin import read_ledger, recorded_seeds, recorded_twin
+from lerobot_vtrefine.diagnose.episode_replay.twin import (
+    describe_other_task,
+    read_ledger,
+    recorded_seeds,
+    recorded_twin,
+)
 from lerobot_vtrefine.embodiments import get_embodiment
 from lerobot_vtrefine.envs.config import VtRefineEnvConfig
 from lerobot_vtrefine.wording import plural
@@ -128,6 +133,9 @@ def compare_episodes(
     else:
         pairs, skipped, frames = _replay_scenes(folder, recorded, config, parts, ledger, film)
     reach = _reach(pairs, config, folder.fps, own)
+    remarks = [] if own else describe_reach(reach, config.scene_config.table_height_m)
+    if ledger is not None and parts == "recorded":
+        remarks += describe_other_task(ledger, config)
     return Comparison(
         root=folder.root,
         fps=folder.fps,
@@ -144,7 +152,7 @@ def compare_episodes(
         pairs=pairs,
         skipped=skipped,
         reach=reach,
-        remarks=[] if own else describe_reach(reach, config.scene_config.table_height_m),
+        remarks=remarks,
         film=frames,
     )
 

@@ -14,6 +14,9 @@ from lerobot_vtrefine.files import decode, limits, read_json
 from lerobot_vtrefine.sim.config import RandomizationConfig, SceneConfig, TaskConfig
 from lerobot_vtrefine.wording import plural
 
+TASK = ("pair", "start", "clearance_m")
+"""What of a scene says which parts an episode begins with, and where; flags of the environment, too."""
+
 
 @dataclass(frozen=True)
 class _Settings:
@@ -78,6 +81,18 @@ def recorded_twin(ledger: Mapping[str, Any], fps: float) -> VtRefineEnvConfig:
         randomization=randomization,
         sensor_model=settings["sensor_model"],
     )
+
+
+def describe_other_task(ledger: Mapping[str, Any], config: VtRefineEnvConfig) -> list[str]:
+    """A remark where a twin's task is not the recorded one: seeds then put other parts elsewhere."""
+    noted = ledger["settings"]["scene"]
+    here = {name: getattr(config.scene_config, name) for name in TASK}
+    others = [name for name in TASK if name in noted and noted[name] != here[name]]
+    if not others:
+        return []
+    twin = ", ".join(f"--env.{name}={here[name]}" for name in others)
+    recorded = " ".join(f"--env.{name}={noted[name]}" for name in others)
+    return [f"the twin has {twin}; for the task that was recorded add {recorded}"]
 
 
 def recorded_seeds(ledger: Mapping[str, Any], folder: EpisodeFolder) -> dict[int, int]:
