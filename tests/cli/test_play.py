@@ -45,7 +45,7 @@ def test_what_is_played_is_logged(tmp_path: Path) -> None:
     assert [row["failure"] for row in rows] == ["time_out", "time_out"]
 
 
-def test_a_recorded_episode_plays_again(tmp_path: Path) -> None:
+def test_a_recorded_episode_plays_again(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     root = tmp_path / "demos"
     record(RecordDemosConfig(root, num_episodes=1, num_envs=1, seed=4, env=ENV))
     noted = json.loads((root / "meta" / "recording.json").read_text())["episodes"][0]
@@ -54,6 +54,11 @@ def test_a_recorded_episode_plays_again(tmp_path: Path) -> None:
     assert row["depth_m"] == noted["depth_m"]
     with pytest.raises(ValueError, match=r"demos has 10 frames/s, the twin --env\.fps=20; give the same"):
         played(dataset=EpisodeSource(root, 0), env=replace(ENV, fps=20))
+    assert "the twin has" not in caplog.text
+    played(dataset=EpisodeSource(root, 0), env=replace(ENV, pair="key", episode_steps=3))
+    assert (
+        "the twin has --env.pair=key; for the task that was recorded add --env.pair=round" in caplog.messages
+    )
 
 
 @pytest.mark.slow

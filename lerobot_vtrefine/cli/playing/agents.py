@@ -1,5 +1,6 @@
 """Who moves the arms in `vtrefine-play`. Shapes: J joints."""
 
+import logging
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -9,7 +10,12 @@ import torch
 from lerobot_vtrefine.choices import check_choice
 from lerobot_vtrefine.datasets.episodes import EpisodeFolder, open_episodes
 from lerobot_vtrefine.datasets.features import raw_to_env_observation
-from lerobot_vtrefine.diagnose.episode_replay.twin import read_ledger, recorded_seeds, recorded_twin
+from lerobot_vtrefine.diagnose.episode_replay.twin import (
+    describe_other_task,
+    read_ledger,
+    recorded_seeds,
+    recorded_twin,
+)
 from lerobot_vtrefine.envs.config import VtRefineEnvConfig
 from lerobot_vtrefine.envs.live_world import IDS, LiveWorld
 from lerobot_vtrefine.lerobot_compat.registration import register
@@ -154,4 +160,6 @@ def recorded_agent(
     agent, ledger = RecordedAgent(folder, episode), read_ledger(folder)
     if ledger is None:
         return agent, env or VtRefineEnvConfig(fps=round(folder.fps)), None
+    for remark in [] if env is None else describe_other_task(ledger, env):
+        logging.warning(remark)
     return agent, env or recorded_twin(ledger, folder.fps), recorded_seeds(ledger, folder)[episode]
