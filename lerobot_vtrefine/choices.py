@@ -1,9 +1,11 @@
-"""One check, and one line, for values that must come from a list, and for network ports."""
+"""One check, and one line, for values that must come from a list, for network ports and for seeds."""
 
 from collections.abc import Iterable
 from difflib import get_close_matches
 
 LARGEST_PORT = 65535
+LARGEST_SEED = 2**53 - 1
+"""Seeds are counted up in arrays of 64 bits, and noted in JSON, whose whole numbers are exact up to here."""
 
 
 def check_choice(name: str, value: object, choices: Iterable[str], others: str = "") -> None:
@@ -25,3 +27,9 @@ def check_port(name: str, port: int) -> None:
     """Raise ValueError unless a network port has this number."""
     if not 1 <= port <= LARGEST_PORT:
         raise ValueError(f"{name} must lie between 1 and {LARGEST_PORT}, got {port}")
+
+
+def check_seed(name: str, seed: int) -> None:
+    """Raise ValueError unless episodes can be counted up from this seed."""
+    if not 0 <= seed <= LARGEST_SEED:
+        raise ValueError(f"{name} must lie between 0 and {LARGEST_SEED}, got {seed}")

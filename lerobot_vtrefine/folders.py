@@ -60,15 +60,12 @@ def check_replaceable(target: Path) -> None:
     """Raise where a folder cannot take the place of ``target``.
 
     Raises:
-        PermissionError: the folder that it lies in, or would, cannot be written to.
-        NotADirectoryError: that is a file.
-        ValueError: ``target`` is mounted or holds this process.
+        OSError: as `check_place`.
+        ValueError: ``target`` is mounted, holds this process or is the root of all folders.
     """
-    above = next(folder for folder in target.absolute().parents if folder.exists())
-    if not above.is_dir():
-        raise NotADirectoryError(f"{target} cannot be written: {above} is a file")
-    if not os.access(above, os.W_OK | os.X_OK):
-        raise PermissionError(f"{target} cannot be written: {above} is read-only; choose another folder")
+    if target.absolute() == target.absolute().parent:
+        raise ValueError(f"{target} cannot be written as a whole; name a folder inside of it")
+    check_place(target)
     if not target.exists():
         return
     reason = None
@@ -78,6 +75,20 @@ def check_replaceable(target: Path) -> None:
         reason = "something is mounted there"
     if reason is not None:
         raise ValueError(f"{target} cannot be written as a whole: {reason}; name a folder inside of it")
+
+
+def check_place(target: Path) -> None:
+    """Raise where no folder ``target`` can be made.
+
+    Raises:
+        PermissionError: the folder that it lies in, or would, cannot be written to.
+        NotADirectoryError: that is a file.
+    """
+    above = next(folder for folder in target.absolute().parents if folder.exists())
+    if not above.is_dir():
+        raise NotADirectoryError(f"{target} cannot be written: {above} is a file")
+    if not os.access(above, os.W_OK | os.X_OK):
+        raise PermissionError(f"{target} cannot be written: {above} is read-only; choose another folder")
 
 
 def recover(target: Path) -> None:

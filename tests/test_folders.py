@@ -137,6 +137,11 @@ def test_where_no_folder_can_be_made_the_one_that_was_asked_for_is_named() -> No
     assert told.value.filename == "/proc/pads"
 
 
+def test_the_root_of_all_folders_is_refused() -> None:
+    with pytest.raises(ValueError, match="^/ cannot be written as a whole; name a folder"), beside(Path("/")):
+        pytest.fail("refused too late")
+
+
 def test_a_folder_within_a_file_is_refused(tmp_path) -> None:
     (tmp_path / "file").write_text("mine")
     with pytest.raises(NotADirectoryError, match=f"{tmp_path / 'file'} is a file"):

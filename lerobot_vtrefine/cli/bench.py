@@ -22,10 +22,11 @@ import draccus
 
 from lerobot_vtrefine.choices import check_choice
 from lerobot_vtrefine.cli.errors import run_cli
-from lerobot_vtrefine.cli.outputs import check_file
+from lerobot_vtrefine.cli.outputs import OVERWRITE, check_new_file
 from lerobot_vtrefine.cli.pipeline.stages import end, last_line, own_sessions
 from lerobot_vtrefine.extras import SIMULATOR, require
 from lerobot_vtrefine.sim.config import WARP_SOLVERS, WarpConfig
+from lerobot_vtrefine.whole_files import write_text
 from lerobot_vtrefine.wording import plural
 
 if TYPE_CHECKING:
@@ -85,6 +86,8 @@ class BenchConfig:
     """Control steps measured for each number of worlds."""
     json: Path | None = None
     """File for the rows as JSON, beside the table."""
+    overwrite: bool = False
+    """Replace a file of --json that is there already."""
 
     def __post_init__(self) -> None:
         unknown = sorted(set(self.parts) - set(PARTS))
@@ -229,7 +232,7 @@ def main() -> int:
     arguments = [f"{item}=true" if item in SWITCHES else item for item in sys.argv[1:]]
     config = draccus.parse(BenchConfig, args=arguments)
     if config.json is not None:
-        check_file("--json", config.json)
+        check_new_file("--json", config.json, overwrite=config.overwrite, how=OVERWRITE)
     if config.plot:
         print(plot(PLOT_DIR))
         return 0
@@ -242,7 +245,7 @@ def main() -> int:
         print(table(rows))
         found = bool(rows)
     if config.json is not None:
-        config.json.write_text(json.dumps([asdict(row) for row in rows], indent=2) + "\n", encoding="utf-8")
+        write_text(config.json, json.dumps([asdict(row) for row in rows], indent=2) + "\n")
     return 0 if found else 1
 
 

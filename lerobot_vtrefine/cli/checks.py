@@ -10,6 +10,7 @@ import yaml
 
 from lerobot_vtrefine.cli.errors import CONFIG_FLAG, meant, values_of
 from lerobot_vtrefine.cli.flags import Flag, flags_of
+from lerobot_vtrefine.folders import check_place
 from lerobot_vtrefine.lerobot_compat.local_places import may_be_on_the_hub, misnamed_policy
 from lerobot_vtrefine.shipped import KINDS, PREFIX
 
@@ -60,6 +61,8 @@ def _check_known(flags: Sequence[Flag], arguments: Sequence[str]) -> None:
 def _check_places(arguments: Sequence[str]) -> None:
     for flag in (*PATHS, *FOLDERS):
         for given in values_of(flag, arguments):
+            if not given:
+                raise ValueError(f"{flag}= names nothing; give a file or a folder, or leave it out")
             if not Path(given).exists() and (flag in FOLDERS or not may_be_on_the_hub(given)):
                 if flag in PATHS and given in KINDS[flag][1]():
                     raise ValueError(f"no such file: {flag}={given}; did you mean {flag}={PREFIX}{given}?")
@@ -70,6 +73,8 @@ def _check_places(arguments: Sequence[str]) -> None:
     for given in map(Path, values_of(RESULTS, arguments)):
         if given.is_file():
             raise NotADirectoryError(f"{RESULTS}={given} is a file; name a folder")
+        if not given.exists():
+            check_place(given)
 
 
 def _check_plugins(arguments: Sequence[str]) -> None:

@@ -68,6 +68,8 @@ def _message(error: BaseException) -> str:
             "the GPU's memory is full: simulate fewer worlds at once, or start fewer runs on it (nvidia-smi"
             " shows them); what was saved is kept, and a command that takes --resume=true goes on from there"
         )
+    if _memory_is_full(error):
+        return "the memory is full: simulate or train on less at once (fewer worlds, a smaller batch)"
     message = " ".join(str(error).split())
     if isinstance(error, _weights_errors()) and os.strerror(errno.ENOSPC) in message:
         return _message(OSError(errno.ENOSPC, ""))
@@ -95,13 +97,19 @@ def _weights_errors() -> tuple[type[Exception], ...]:
 def _is_expected(error: Exception) -> bool:
     """Whether a user can do something about it; anything else is a defect."""
     kinds = (*EXPECTED, *_network_errors(), *_weights_errors())
-    return isinstance(error, kinds) or _gpu_is_full(error)
+    return isinstance(error, kinds) or _gpu_is_full(error) or _memory_is_full(error)
 
 
 def _gpu_is_full(error: BaseException) -> bool:
     """Whether torch or Warp, which has no exception of its own for it, got no memory on a GPU."""
     of_warp = re.match(r"Failed to allocate \d+ bytes on device", str(error))
     return bool(of_warp) or isinstance(error, _of_library("torch", "OutOfMemoryError"))
+
+
+def _memory_is_full(error: BaseException) -> bool:
+    """Whether NumPy, MuJoCo or torch, each with an exception of another kind for it, got no memory."""
+    told = re.search(r"std::bad_alloc|DefaultCPUAllocator: (can't allocate|not enough) memory", str(error))
+    return isinstance(error, MemoryError) or bool(told)
 
 
 def _in_flags(message: str) -> str:
@@ -206,8 +214,8 @@ def run_cli[**P](main: Callable[P, int | None]) -> Callable[P, int]:
     """Wrap a console entry point so that expected errors end as ``error: ...`` with exit status 2.
 
     ``ValueError``, ``OSError`` (missing files, full disk), ``ImportError`` (an extra is not installed),
-    ``FloatingPointError`` (training that diverged), draccus' parsing errors and a GPU without memory are
-    expected; anything else is a defect and keeps its traceback. Ctrl-C exits with 130, as `exit_status` says;
+    ``FloatingPointError`` (training that diverged), draccus' parsing errors, and too little memory, of a GPU
+    or not, are expected; anything else is a defect and keeps its traceback. Ctrl-C exits with 130, as `exit_status` says;
     where ``head`` has seen enough, a command ends without a word, and with the status of a command that it
     ran where that one failed. With ``VTREFINE_DEBUG=1`` in the environment every error keeps its traceback.
     """

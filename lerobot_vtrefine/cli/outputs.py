@@ -5,7 +5,7 @@ from collections.abc import Generator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
-from lerobot_vtrefine.folders import beside, put_in_place, recover
+from lerobot_vtrefine.folders import beside, check_replaceable, put_in_place, recover
 
 OVERWRITE = "--overwrite=true"
 """As LeRobot's parser takes it; ours takes --overwrite alone."""
@@ -28,6 +28,7 @@ def staged(
     if output_dir.exists() and not output_dir.is_dir():
         raise NotADirectoryError(f"--output_dir={output_dir} is a file; name a folder")
     target = output_dir.resolve()
+    check_replaceable(target)
     recover(target)
     present = [name for name in names if (target / name).exists()]
     if present and not overwrite:
@@ -70,5 +71,7 @@ def _try(folder: Path, told: str) -> None:
     try:
         folder.mkdir(parents=True, exist_ok=True)
         tempfile.TemporaryFile(dir=folder).close()
+    except (FileExistsError, NotADirectoryError):  # part of the way to it
+        raise NotADirectoryError(f"{told} cannot be written: {folder} is not a folder") from None
     except OSError as error:
         raise OSError(error.errno, error.strerror, told) from error

@@ -18,7 +18,7 @@ from lerobot.configs.default import EvalConfig
 from lerobot.envs.configs import EnvConfig
 from lerobot.utils.utils import init_logging
 
-from lerobot_vtrefine.choices import check_choice, check_port
+from lerobot_vtrefine.choices import check_choice, check_port, check_seed
 from lerobot_vtrefine.cli.errors import run_cli
 from lerobot_vtrefine.cli.outputs import check_folder
 from lerobot_vtrefine.cli.playing.agents import Agent, PolicyAgent, recorded_agent, scripted_agent
@@ -92,8 +92,8 @@ class PlayConfig:
             checked_env(self.env)
         if self.episodes is not None and self.episodes < 1:
             raise ValueError(f"--episodes must be at least 1, got {self.episodes}")
-        if self.seed is not None and self.seed < 0:
-            raise ValueError(f"--seed must not be negative, got {self.seed}")
+        if self.seed is not None:
+            check_seed("--seed", self.seed)
         if self.policy.path is not None and self.dataset.root is not None:
             raise ValueError("give --policy.path or --dataset.root, not both")
 

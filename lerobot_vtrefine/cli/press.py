@@ -19,6 +19,8 @@ examples:
   vtrefine-press --reality=reality.json --output_dir=presses
   vtrefine-diagnose --recording=presses --output_dir=diagnosis"""
 REPLICATES = 2
+MOST_TRIALS = 10_000
+"""Files are numbered by four digits."""
 
 
 def make_parser() -> CommandParser:
@@ -45,12 +47,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
     options = make_parser().parse_args(arguments)
     if options.trials < REPLICATES or options.trials % REPLICATES:
         raise ValueError(f"--trials must be an even number of at least {REPLICATES}, got {options.trials}")
+    if options.trials > MOST_TRIALS:
+        raise ValueError(f"--trials must be at most {MOST_TRIALS}, got {options.trials}")
     if options.seed < 0:
         raise ValueError(f"--seed must be at least 0, got {options.seed}")
     require("vtrefine-press", SIMULATOR)
-    from lerobot_vtrefine.diagnose.pad.stand_in_rig import record
-
     with staged(options.output_dir, ("recording.json",), overwrite=options.overwrite) as folder:
+        from lerobot_vtrefine.diagnose.pad.stand_in_rig import record
+
         record(options.reality, folder, options.trials, options.seed)
     print(f"{plural(options.trials, 'recording')} in {options.output_dir}")
     print(

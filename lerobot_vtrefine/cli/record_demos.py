@@ -21,6 +21,7 @@ from lerobot.envs.configs import EnvConfig
 from lerobot.utils.utils import init_logging
 from tqdm import tqdm
 
+from lerobot_vtrefine.choices import check_seed
 from lerobot_vtrefine.cli.errors import after_interrupt, run_cli
 from lerobot_vtrefine.cli.hub import check_upload
 from lerobot_vtrefine.cli.sharing import push_dataset
@@ -72,9 +73,10 @@ class RecordDemosConfig:
     """Unused; lets files of configs/env serve this command too."""
 
     def __post_init__(self) -> None:
-        for name, lowest in (("num_episodes", 1), ("num_envs", 1), ("num_workers", 0), ("seed", 0)):
+        for name, lowest in (("num_episodes", 1), ("num_envs", 1), ("num_workers", 0)):
             if getattr(self, name) < lowest:
                 raise ValueError(f"--{name} must be at least {lowest}, got {getattr(self, name)}")
+        check_seed("--seed", self.seed)
         if self.push_to_hub:
             check_upload(self.repo_id)
         checked_env(self.env)

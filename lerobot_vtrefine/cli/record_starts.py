@@ -21,6 +21,7 @@ from lerobot.envs.configs import EnvConfig
 from lerobot.utils.utils import init_logging
 from tqdm import tqdm
 
+from lerobot_vtrefine.choices import check_seed
 from lerobot_vtrefine.cli.errors import after_interrupt, run_cli
 from lerobot_vtrefine.cli.outputs import OVERWRITE, check_new_file
 from lerobot_vtrefine.envs import VtRefineEnvConfig
@@ -69,9 +70,10 @@ class RecordStartsConfig:
     """Unused; lets files of configs/env serve this command too."""
 
     def __post_init__(self) -> None:
-        for name, lowest in (("num_starts", FEWEST), ("num_envs", 1), ("attempts", 1), ("seed", 0)):
+        for name, lowest in (("num_starts", FEWEST), ("num_envs", 1), ("attempts", 1)):
             if getattr(self, name) < lowest:
                 raise ValueError(f"--{name} must be at least {lowest}, got {getattr(self, name)}")
+        check_seed("--seed", self.seed)
         if checked_env(self.env).scene_config.start != "table":
             raise ValueError("parts are grasped from the table: use --env.start=table")
 

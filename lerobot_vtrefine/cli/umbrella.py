@@ -60,18 +60,23 @@ def configurations() -> str:
     return "\n".join(lines)
 
 
+def version() -> str:
+    """Name and version of the installed distribution."""
+    return f"{DISTRIBUTION} {distribution(DISTRIBUTION).version}"
+
+
+ANSWERS = {"-h": overview, "--help": overview, "--version": version, "configs": configurations}
+"""What is no command."""
+
+
 @run_cli
 def main() -> int:
     """Console entry point."""
     name, *rest = sys.argv[1:] or ["--help"]
-    if name in ("-h", "--help"):
-        print(overview())
-        return 0
-    if name == "--version":
-        print(f"{DISTRIBUTION} {distribution(DISTRIBUTION).version}")
-        return 0
-    if name == "configs":
-        print(configurations())
+    if name in ANSWERS:
+        if rest:
+            raise ValueError(f"vtrefine {name} takes nothing more, got {' '.join(rest)}")
+        print(ANSWERS[name]())
         return 0
     known = commands()
     if name not in known:

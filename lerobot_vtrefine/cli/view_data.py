@@ -5,7 +5,8 @@ import errno
 import os
 import shlex
 import shutil
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Iterator, Sequence
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -13,10 +14,11 @@ import numpy as np
 
 from lerobot_vtrefine.cli.arguments import CommandParser, read_list
 from lerobot_vtrefine.cli.errors import run_cli
-from lerobot_vtrefine.cli.outputs import check_file
+from lerobot_vtrefine.cli.outputs import check_new_file
 from lerobot_vtrefine.embodiments import pad_layout_of
 from lerobot_vtrefine.tactile.layout import PadLayout
 from lerobot_vtrefine.view.rerun_viewer import import_rerun
+from lerobot_vtrefine.whole_files import whole_file
 from lerobot_vtrefine.wording import plural
 
 DESCRIPTION = """\
@@ -40,6 +42,7 @@ def make_parser() -> CommandParser:
     add("--dataset.repo_id", dest="repo_id", metavar="NAME", help="LeRobot dataset, by its name on the Hub")
     add("--episodes", type=episodes, metavar="LIST", help="episodes to show (default: '[0]')")
     add("--save", type=Path, metavar="FILE", help="write a rerun file (.rrd) instead of opening the viewer")
+    add("--overwrite", action="store_true", help="replace a file of --save that is there already")
     return parser
 
 
@@ -61,21 +64,32 @@ def main(arguments: Sequence[str] | None = None) -> None:
         raise ValueError("give either --dataset.root=DIR or --dataset.repo_id=NAME")
     rr = import_rerun("vtrefine-view-data", options.save)
     if options.save is not None:
-        check_file("--save", options.save)
+        check_new_file("--save", options.save, overwrite=options.overwrite, how="--overwrite")
     root = options.root or downloaded(options.repo_id)
     shown = options.episodes or [0]
     open_episodes(root).read(shown)  # before a viewer opens for nothing
     rr.init("vtrefine-view-data", spawn=options.save is None)
-    if options.save is not None:
-        rr.save(options.save)
-    frames = sum(log_episode(rr, root, index) for index in shown)
-    rr.rerun_shutdown()
-    if options.save is not None and shutil.disk_usage(options.save.parent).free < LEAST_FREE_BYTES:
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(options.save))  # rerun only logs it
+    with nullcontext() if options.save is None else saved(rr, options.save):
+        frames = sum(log_episode(rr, root, index) for index in shown)
+        rr.rerun_shutdown()
     where = f" -> {options.save}" if options.save is not None else ""
     print(f"{plural(len(shown), 'episode')}, {plural(frames, 'frame')}{where}")
     if options.save is not None:
         print(f"open it: rerun {shlex.quote(str(options.save))}")
+
+
+@contextmanager
+def saved(rr: Any, path: Path) -> Generator[None]:
+    """What is logged within becomes a rerun file, whole or not at all.
+
+    Raises:
+        OSError: the disk is full, which rerun only logs.
+    """
+    with whole_file(path) as part:
+        rr.save(part)
+        yield
+        if shutil.disk_usage(path.parent).free < LEAST_FREE_BYTES:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
 
 
 def downloaded(repo_id: str) -> Path:

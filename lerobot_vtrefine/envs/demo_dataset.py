@@ -78,6 +78,7 @@ class DemoDataset:
     ) -> None:
         self.root = Path(root)
         self._place = self.root.resolve()
+        check_replaceable(self._place)
         self._work = working_folder(self._place)
         self._task = task
         self._body = body
@@ -88,7 +89,6 @@ class DemoDataset:
         self._uncommitted = 0
         self._saving = False
         recover(self._place)
-        check_replaceable(self._place)
         if self._place.is_file() or (self._place.is_dir() and any(self._place.iterdir())):
             self._continue()
 

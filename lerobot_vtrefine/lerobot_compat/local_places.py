@@ -3,6 +3,7 @@
 LeRobot ends in a hundred lines about the network then, or about a name that no Hub would take.
 """
 
+import json
 import sys
 from pathlib import Path
 
@@ -61,21 +62,55 @@ def missing_policy(given: str) -> str:
     from huggingface_hub import hf_hub_download
     from huggingface_hub.errors import RemoteEntryNotFoundError, RepositoryNotFoundError
 
+    silent = f"{told}, and the Hub, where it may be, does not answer"
+    if is_out_of_reach(given):
+        return silent
     try:
         hf_hub_download(given, CONFIG)  # as LeRobot does next
     except (RepositoryNotFoundError, RemoteEntryNotFoundError):
         return f"{told}, and the Hub has no policy of this name that this account may read"
     except (OSError, ValueError):
-        return f"{told}, and the Hub, where it may be, does not answer"
+        return silent
     return ""
 
 
+def is_out_of_reach(name: str) -> bool:
+    """Whether a policy of the Hub is not in the cache, and no connection can be made.
+
+    One question tells it at once; a download asks for half a minute.
+    """
+    import httpx
+    from huggingface_hub import get_hf_file_metadata, hf_hub_url, try_to_load_from_cache
+
+    try:
+        if not isinstance(try_to_load_from_cache(name, CONFIG), str):
+            get_hf_file_metadata(hf_hub_url(name, CONFIG))
+    except httpx.ConnectError:
+        return True
+    except (httpx.HTTPError, OSError, ValueError):
+        pass  # of which the download tells more
+    return False
+
+
 def misnamed_policy(folder: Path) -> str:
-    """Which folder to take where one that is there is not a policy's own; nothing where it is."""
+    """Which folder to take where one that is there is not a policy's own, or what is wrong with its
+    settings; nothing where it is a policy's.
+    """
     if (folder / CONFIG).is_file():
-        return ""
+        return damaged_settings(folder)
     way_out = where_policy_is(folder) or "name a checkpoint's pretrained_model"
     return f"{POLICY_PATH}={folder} is not a policy's own folder: {way_out}"
+
+
+def damaged_settings(folder: Path) -> str:
+    """Why a policy's own folder has no settings to be read, of which LeRobot tells no file; or nothing."""
+    try:
+        settings = json.loads((folder / CONFIG).read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        return f"{folder}: {CONFIG} is not valid JSON ({error})"
+    if not isinstance(settings, dict):
+        return f"{folder}: {CONFIG} does not hold settings by name"
+    return ""
 
 
 def where_policy_is(folder: Path) -> str:

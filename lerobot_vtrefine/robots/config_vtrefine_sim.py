@@ -9,7 +9,7 @@ from draccus.utils import DraccusException
 from lerobot.envs.configs import EnvConfig
 from lerobot.robots.config import RobotConfig
 
-from lerobot_vtrefine.choices import check_choice, check_port
+from lerobot_vtrefine.choices import check_choice, check_port, check_seed
 from lerobot_vtrefine.envs.config import VtRefineEnvConfig
 from lerobot_vtrefine.files import read_yaml
 from lerobot_vtrefine.lerobot_compat.config_errors import told_by_lerobot
@@ -55,8 +55,7 @@ class VtRefineSimConfig(RobotConfig):
         super().__post_init__()
         check_choice("--robot.view", self.view, VIEWS)
         check_port("--robot.view_port", self.view_port)
-        if self.seed < 0:
-            raise ValueError(f"--robot.seed must not be negative, got {self.seed}")
+        check_seed("--robot.seed", self.seed)
         check_control_rate("--robot.fps", self.fps)
         if not 1 <= self.episode_s <= 3600:
             raise ValueError(f"--robot.episode_s must lie between 1 and 3600, got {self.episode_s}")

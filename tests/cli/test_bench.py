@@ -43,6 +43,16 @@ def test_rows_are_printed_and_written(
         "broken: failed with status 1: RuntimeError: no such pad",
     ]
     assert json.loads(target.read_text())[0]["ratio"] == 0.8
+    again = ["vtrefine-bench", "--parts=[fine]", f"--json={target}"]
+    target.write_text("mine")
+    monkeypatch.setattr(sys, "argv", again)
+    assert bench.main() == 2
+    told = capsys.readouterr().err
+    assert told == f"error: {target} exists; choose another --json or add --overwrite=true to replace it\n"
+    assert target.read_text() == "mine"
+    monkeypatch.setattr(sys, "argv", [*again, "--overwrite=true"])
+    assert bench.main() == 0
+    assert json.loads(target.read_text())[0]["ratio"] == 0.8
 
 
 @pytest.mark.usefixtures("fake_parts")

@@ -209,6 +209,22 @@ def test_a_gpu_without_memory_is_one_line(error: Exception, capsys) -> None:
     assert told.count("\n") == 1
 
 
+@pytest.mark.parametrize(
+    "error",
+    [
+        MemoryError(),
+        ValueError("std::bad_alloc"),  # MuJoCo's
+        RuntimeError("[enforce fail at alloc_cpu.cpp:117] . DefaultCPUAllocator: can't allocate memory: 8 GB"),
+    ],
+    ids=["NumPy", "MuJoCo", "torch"],
+)
+def test_too_little_memory_is_one_line(error: Exception, capsys) -> None:
+    assert failing(error)() == 2
+    told = capsys.readouterr().err
+    assert told.startswith("error: the memory is full: simulate or train on less at once")
+    assert told.count("\n") == 1
+
+
 @pytest.mark.parametrize("lines", [1, 100_000], ids=["at its end", "while it writes"])
 def test_a_command_whose_reader_has_seen_enough_ends_without_a_word(lines) -> None:
     command = (

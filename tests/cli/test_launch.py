@@ -177,6 +177,12 @@ def test_a_flag_may_stand_in_a_file_or_name_what_lies_below_it(tmp_path: Path) -
             "--policy.path=docs is not a policy's own folder: name a checkpoint's pretrained_model",
         ),
         (launch.replay, ["--output_dir=README.md"], "--output_dir=README.md is a file; name a folder"),
+        (
+            launch.finetune,
+            ["--output_dir=/etc/hosts/run"],
+            "/etc/hosts/run cannot be written: /etc/hosts is a file",
+        ),
+        (launch.play, ["--policy.path="], "--policy.path= names nothing; give a file or a folder, or leave it out"),
     ],
 )
 def test_what_is_wrong_with_a_command_line_is_told_before_lerobot_is_loaded(
@@ -314,6 +320,10 @@ def test_the_umbrella_runs_a_command_as_if_called_by_its_name(monkeypatch, capsy
     error = capsys.readouterr().err
     assert "unknown command 'diagnos'; choose from" in error
     assert error.endswith("did you mean diagnose?\n")
+    for name in ("configs", "--version"):
+        monkeypatch.setattr(sys, "argv", ["vtrefine", name, "square"])
+        assert umbrella.main() == 2
+        assert capsys.readouterr().err == f"error: vtrefine {name} takes nothing more, got square\n"
 
 
 def test_a_local_dataset_that_is_not_there_is_named(monkeypatch, tmp_path: Path) -> None:
@@ -364,6 +374,7 @@ def test_a_policy_that_is_not_there_is_named(monkeypatch, tmp_path: Path) -> Non
 
     answers = {"outputs/polcy": not_found, "me/insertion": LocalEntryNotFoundError}
     monkeypatch.setattr("huggingface_hub.hf_hub_download", hub)
+    monkeypatch.setattr("huggingface_hub.get_hf_file_metadata", lambda _: None)
 
     def told(path: str, command: str = "lerobot-eval") -> str:
         monkeypatch.setattr(sys, "argv", [f"/bin/{command}", f"--policy.path={path}"])
@@ -387,6 +398,29 @@ def test_a_policy_that_is_not_there_is_named(monkeypatch, tmp_path: Path) -> Non
     assert told("me/insertion").endswith("no such folder, and the Hub, where it may be, does not answer")
     monkeypatch.setattr("huggingface_hub.hf_hub_download", lambda *_: "config.json")
     assert told("me/insertion") == ""
+    (own / "config.json").write_text("{")
+    assert told(str(own)).startswith(f"error: {own}: config.json is not valid JSON (Expecting")
+    (own / "config.json").write_text("[]")
+    assert told(str(own)) == f"error: {own}: config.json does not hold settings by name"
+
+
+def test_without_a_network_a_policy_of_the_hub_is_asked_for_once(monkeypatch, tmp_path: Path) -> None:
+    """A download tries for half a minute; one from the cache needs no network."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["/bin/lerobot-eval", "--policy.path=me/insertion"])
+    downloads = []
+
+    def unreachable(_: str) -> None:
+        raise httpx.ConnectError("Name or service not known")
+
+    monkeypatch.setattr("huggingface_hub.get_hf_file_metadata", unreachable)
+    monkeypatch.setattr("huggingface_hub.hf_hub_download", lambda *name: downloads.append(name))
+    with pytest.raises(SystemExit, match="and the Hub, where it may be, does not answer"):
+        refuse_missing_places()
+    assert not downloads
+    monkeypatch.setattr("huggingface_hub.try_to_load_from_cache", lambda *_: "/cache/config.json")
+    refuse_missing_places()
+    assert downloads
 
 
 def test_stock_commands_get_the_path_when_they_discover_the_plugin(monkeypatch) -> None:

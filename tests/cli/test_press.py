@@ -38,3 +38,19 @@ def test_the_next_command_can_be_copied_where_paths_have_spaces(
     assert press.main([f"--output_dir={folder}", "--trials=2"]) == 0
     (line,) = [line for line in capsys.readouterr().out.splitlines() if line.startswith("next: ")]
     assert f"--recording={folder}" in shlex.split(line)
+
+
+@pytest.mark.parametrize(
+    ("flag", "told"),
+    [
+        ("--trials=0", "--trials must be an even number of at least 2, got 0"),
+        ("--trials=1000000000", "--trials must be at most 10000, got 1000000000"),
+        ("--output_dir=/", "/ cannot be written as a whole; name a folder inside of it"),
+    ],
+)
+def test_bad_flags_are_one_line(
+    flag: str, told: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert press.main([f"--output_dir={tmp_path / 'presses'}", flag]) == 2
+    assert capsys.readouterr().err == f"error: {told}\n"
+    assert list(tmp_path.iterdir()) == []

@@ -181,6 +181,8 @@ def test_stock_tools_accept_the_dataset(demos: Path, tmp_path: Path):
         (["--num_episodes=0"], "--num_episodes must be at least 1"),
         (["--push_to_hub=true"], "--repo_id=local/vtrefine_demos: give a name on the Hub"),
         (["--num_envs=0"], "--num_envs must be at least 1"),
+        (["--seed=-1"], "--seed must lie between 0 and 9007199254740991, got -1"),
+        (["--seed=99999999999999999999"], "--seed must lie between 0 and 9007199254740991, got 99999"),
         (["--env.pair=star"], "round, square, hexagon"),
         (["--env.clearance_m=-1"], "clearance_m must be above 0"),
         (["--env.clearance_m=0"], "clearance_m must be above 0"),
@@ -195,6 +197,11 @@ def test_bad_flags_end_in_one_line(flags, message, tmp_path, capsys):
     assert last.startswith("error:")
     assert message in last
     assert not (tmp_path / "x").exists()
+
+
+def test_the_root_of_all_folders_is_no_dataset(capsys) -> None:
+    assert record(Path("/"), "--num_episodes=1") == 2
+    assert "error: / cannot be written as a whole; name a folder inside of it" in capsys.readouterr().err
 
 
 class Painter:

@@ -72,6 +72,7 @@ def test_a_pressed_taxel_is_bright_at_its_place() -> None:
         (["--dataset.root=TINY", "--episodes=[0, 99]"], "episode 99 was asked for"),
         (["--dataset.root=TINY", "--save=TINY"], "is a folder; name a file in it"),
         (["--dataset.root=TINY", "--save=/proc/x.rrd"], "--save=/proc/x.rrd"),
+        (["--dataset.root=TINY", "--save=/etc/hosts/x.rrd"], "x.rrd cannot be written: /etc/hosts is not a"),
         (["--dataset.root=TINY", "--episodes=first"], "argument --episodes: give a list such as '[0, 2]'"),
     ],
 )
@@ -82,6 +83,34 @@ def test_bad_flags_are_one_line(arguments, message, tiny_dataset: Path, tmp_path
     error = capsys.readouterr().err
     assert message in error
     assert error.count("\n") == 1
+
+
+def test_no_file_is_replaced_without_being_asked_to(tiny_dataset: Path, tmp_path: Path, capsys) -> None:
+    pytest.importorskip("rerun")
+    target = tmp_path / "demos.rrd"
+    target.write_text("mine")
+    given = [f"--dataset.root={tiny_dataset}", f"--save={target}"]
+    assert view_data.main(given) == 2
+    told = capsys.readouterr().err
+    assert told == f"error: {target} exists; choose another --save or add --overwrite to replace it\n"
+    assert target.read_text() == "mine"
+    assert view_data.main([*given, "--overwrite"]) == 0
+    assert b"/cloud" in target.read_bytes()
+
+
+def test_an_interrupted_file_is_not_there(tiny_dataset: Path, tmp_path: Path, monkeypatch) -> None:
+    pytest.importorskip("rerun")
+
+    def interrupted(*_) -> int:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(view_data, "log_episode", interrupted)
+    target = tmp_path / "demos.rrd"
+    target.write_text("mine")
+    given = [f"--dataset.root={tiny_dataset}", f"--save={target}", "--overwrite"]
+    assert view_data.main(given) == 130
+    assert target.read_text() == "mine"
+    assert list(tmp_path.iterdir()) == [target]
 
 
 def test_a_file_that_a_full_disk_cut_off_is_told(
