@@ -13,7 +13,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from lerobot_vtrefine.cli.arguments import CommandParser
+from lerobot_vtrefine.cli.arguments import CommandParser, at_least
 from lerobot_vtrefine.cli.errors import run_cli
 from lerobot_vtrefine.cli.pipeline.demo_config import EVAL_SEED_OFFSET
 from lerobot_vtrefine.finetune.config import TrustRegionDppo
@@ -40,7 +40,7 @@ def main() -> None:
     parser.add_argument("--task", type=Path, required=True, help="a file as in configs/env")
     parser.add_argument("--dataset", type=Path, help="recordings of the task, for the replaced touch")
     parser.add_argument("--kinds", nargs="+", choices=KINDS, default=KINDS, help="default: all")
-    parser.add_argument("--episodes", type=int, default=512, help="run side by side")
+    parser.add_argument("--episodes", type=at_least(1), default=512, help="run side by side")
     parser.add_argument("--device", default="cpu", help="of simulation and policy: cpu or cuda")
     args = parser.parse_args()
     wanting = [kind for kind in args.kinds if kind in ("touch", "touch_other") and not args.dataset]

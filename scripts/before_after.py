@@ -14,8 +14,9 @@ from pathlib import Path
 import draccus
 from PIL import Image, ImageDraw
 
-from lerobot_vtrefine.cli.arguments import CommandParser
+from lerobot_vtrefine.cli.arguments import CommandParser, at_least
 from lerobot_vtrefine.cli.errors import run_cli
+from lerobot_vtrefine.cli.outputs import check_file
 from lerobot_vtrefine.cli.playing.agents import PolicyAgent
 from lerobot_vtrefine.cli.report.gif import write_gif
 from lerobot_vtrefine.envs import VtRefineEnvConfig
@@ -81,10 +82,11 @@ def main() -> None:
         help="above the pictures (default: %(default)s)",
     )
     parser.add_argument("--output", type=Path, required=True, help="GIF to write")
-    parser.add_argument("--seed", type=int, default=0, help="of the first episode")
-    parser.add_argument("--episodes", type=int, default=3, help="default %(default)s")
-    parser.add_argument("--width", type=int, default=900, help="of the picture, in pixels")
+    parser.add_argument("--seed", type=at_least(0), default=0, help="of the first episode")
+    parser.add_argument("--episodes", type=at_least(1), default=3, help="default %(default)s")
+    parser.add_argument("--width", type=at_least(1), default=900, help="of the picture, in pixels")
     flags = parser.parse_args()
+    check_file("--output", flags.output)
     env = draccus.decode(VtRefineEnvConfig, _env(flags.config_path))
     seeds = range(flags.seed, flags.seed + flags.episodes)
     left, right = (list(filmed(policy, env, seeds)) for policy in (flags.before, flags.after))

@@ -18,7 +18,7 @@ from typing import Any
 
 from runs.sets import add_arguments, run_sets, shuffled
 
-from lerobot_vtrefine.cli.arguments import CommandParser
+from lerobot_vtrefine.cli.arguments import CommandParser, at_least
 from lerobot_vtrefine.cli.errors import run_cli
 from lerobot_vtrefine.cli.results import rows as results
 
@@ -33,13 +33,18 @@ def arguments() -> argparse.Namespace:
     """The command line."""
     parser = CommandParser(description=__doc__)
     parser.add_argument("--groups", default=",".join(cases.GROUPS), help="comma-separated: %(default)s")
-    parser.add_argument("--per_cell", type=int, help="sets per cell in place of each group's own count")
+    parser.add_argument(
+        "--per_cell", type=at_least(1), help="sets per cell in place of each group's own count"
+    )
     parser.add_argument("--quick", action="store_true", help="about a fifth of the sets")
     parser.add_argument(
-        "--first_seed", type=int, default=cases.REPORT_SEED, help="0 to tune; default %(default)s"
+        "--first_seed", type=at_least(0), default=cases.REPORT_SEED, help="0 to tune; default %(default)s"
     )
     parser.add_argument(
-        "--naive_every", type=int, default=12, help="run the naive analysts on every n-th set; 0: never"
+        "--naive_every",
+        type=at_least(0),
+        default=12,
+        help="run the naive analysts on every n-th set; 0: never",
     )
     parser.add_argument("--only", help="run sets whose name contains this")
     parser.add_argument("--before", type=Path, help="earlier results/diagnosis.json, as a column of table.md")

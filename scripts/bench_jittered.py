@@ -13,6 +13,7 @@ count them one by one; they take about 1400 s of one core:
 
 import argparse
 import importlib
+import re
 import sys
 import time
 from itertools import product
@@ -61,32 +62,65 @@ def specimen(law: str, gain: float, seed: int) -> int:
     return int(np.random.SeedSequence([seed, place, round(100 * gain)]).generate_state(1)[0])
 
 
+def seed_range(text: str) -> tuple[int, int]:
+    """The first seed, and the last one + 1."""
+    found = re.fullmatch(r"(\d+):(\d+)", text)
+    if not found or int(found[1]) >= int(found[2]):
+        raise argparse.ArgumentTypeError(f"give the first and the last + 1, such as 0:2, got {text!r}")
+    return int(found[1]), int(found[2])
+
+
+def pad_size(text: str) -> tuple[int, int]:
+    """Rows and columns."""
+    found = re.fullmatch(r"([1-9]\d?)x([1-9]\d?)", text)
+    if not found:
+        raise argparse.ArgumentTypeError(f"give rows and columns, such as 12x32, got {text!r}")
+    return int(found[1]), int(found[2])
+
+
+def gain_list(text: str) -> list[float]:
+    """Achievable gains, which are shares."""
+    try:
+        found = [float(part) for part in text.split(",")]
+    except ValueError:
+        found = []
+    if not found or not all(0 < gain < 1 for gain in found):
+        raise argparse.ArgumentTypeError(f"give numbers between 0 and 1, such as 0.2,0.4, got {text!r}")
+    return found
+
+
 def arguments() -> argparse.Namespace:
     """The command line."""
     parser = CommandParser(description=__doc__)
     laws = [CLEAN, *jittered_rig.EFFECTS]
     parser.add_argument("--laws", default=",".join(laws), help="comma-separated: %(default)s")
-    parser.add_argument("--gains", default="0.2,0.4", help="achievable gains (default %(default)s)")
-    parser.add_argument("--seeds", default="0:2", help="first and last + 1 (default %(default)s, for tuning)")
-    parser.add_argument("--pad", default="12x32", help="rows and columns (default %(default)s)")
+    parser.add_argument(
+        "--gains", type=gain_list, default="0.2,0.4", help="achievable gains (default %(default)s)"
+    )
+    parser.add_argument(
+        "--seeds", type=seed_range, default="0:2", help="first and last + 1 (default %(default)s, for tuning)"
+    )
+    parser.add_argument(
+        "--pad", type=pad_size, default="12x32", help="rows and columns (default %(default)s)"
+    )
     add_arguments(parser, ROOT / "outputs" / "bench_jittered")
     return parser.parse_args()
 
 
 def chosen(args: argparse.Namespace) -> dict[str, Any]:
     """The sets of this run by their names; clean ones have no gain, and more seeds."""
-    first, last = (int(part) for part in args.seeds.split(":"))
-    rows, cols = (int(part) for part in args.pad.split("x"))
+    first, last = args.seeds
+    rows, cols = args.pad
     sets = []
     for law in args.laws.split(","):
         if law != CLEAN and law not in jittered_rig.EFFECTS:
             raise ValueError(f"--laws: unknown {law!r}; valid: {CLEAN}, {', '.join(jittered_rig.EFFECTS)}")
         clean = law == CLEAN
         seeds = range(first, last + (CLEAN_PER_LAW - 1) * (last - first) * clean)
-        gains = [0.0] if clean else [float(part) for part in args.gains.split(",")]
+        gains = [0.0] if clean else args.gains
         sets += [(law, gain, seed, rows, cols) for gain, seed in product(gains, seeds)]
     return {
-        f"{law}-{gain}-{seed}-{args.pad}": (law, gain, seed, *size)
+        f"{law}-{gain}-{seed}-{rows}x{cols}": (law, gain, seed, *size)
         for law, gain, seed, *size in shuffled(sets)
     }
 

@@ -23,7 +23,7 @@ from typing import Any
 
 from runs.sets import Row, add_arguments, run_sets
 
-from lerobot_vtrefine.cli.arguments import CommandParser
+from lerobot_vtrefine.cli.arguments import CommandParser, at_least
 from lerobot_vtrefine.cli.errors import run_cli
 
 ROOT = Path(__file__).parents[1]
@@ -133,8 +133,10 @@ def failures(rows: list[Row]) -> list[str]:
 def arguments() -> argparse.Namespace:
     """The command line."""
     parser = CommandParser(description=__doc__)
-    parser.add_argument("--first_seed", type=int, default=1000, help="default %(default)s, for tuning")
-    parser.add_argument("--sets", type=int, default=60, help="default %(default)s")
+    parser.add_argument(
+        "--first_seed", type=at_least(0), default=1000, help="default %(default)s, for tuning"
+    )
+    parser.add_argument("--sets", type=at_least(1), default=60, help="default %(default)s")
     add_arguments(parser, ROOT / "outputs" / "bench_outsider")
     return parser.parse_args()
 

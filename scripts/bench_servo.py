@@ -32,7 +32,7 @@ from lerobot_vtrefine.diagnose.core.resampling import gain_interval
 from lerobot_vtrefine.diagnose.predict import load_predictor, predict_frames
 from lerobot_vtrefine.diagnose.recordings import RecordingSet, RobotTrial, read_recording_set
 from lerobot_vtrefine.diagnose.report.words import title
-from lerobot_vtrefine.diagnose.servo.bench import Bench
+from lerobot_vtrefine.diagnose.servo.bench import Bench, on_bench
 
 ROOT = Path(__file__).parents[1]
 Array = np.ndarray
@@ -121,6 +121,8 @@ def main() -> None:
     options = parser.parse_args()
     options.output_dir.mkdir(parents=True, exist_ok=True)
     whole = read_recording_set(options.recording)
+    if not on_bench(whole):
+        raise ValueError(f"--recording={options.recording} is not of a servo with a known load")
     bench = Bench.of(whole)
     settings = np.array(bench.settings)
     found, labels, said = [], [], []

@@ -25,8 +25,9 @@ from lerobot.utils.random_utils import set_seed
 from torch import Tensor
 from tqdm import trange
 
-from lerobot_vtrefine.cli.arguments import CommandParser
+from lerobot_vtrefine.cli.arguments import CommandParser, at_least
 from lerobot_vtrefine.cli.errors import run_cli
+from lerobot_vtrefine.cli.outputs import check_folder
 from lerobot_vtrefine.datasets.features import ACTION_KEY, LIMITS_KEY, STATE_KEY, TRUTH_KEY
 from lerobot_vtrefine.files.text import read_yaml
 from lerobot_vtrefine.finetune.distributed import check_device
@@ -85,7 +86,7 @@ def load(args: argparse.Namespace) -> tuple[VtDp3Policy, tuple[Any, Any], LeRobo
 
     Raises: ValueError for a policy whose encoder is trained; for a dataset as `check_complete`.
     """
-    fields = read_yaml(CONFIG)["policy"] | {"device": args.device} | json.loads(args.policy)
+    fields = read_yaml(CONFIG)["policy"] | {"device": args.device} | args.policy
     config = draccus.decode(PreTrainedConfig, fields)
     if not getattr(config, "freeze_encoder", False):
         raise ValueError("--policy: features can be kept where freeze_encoder is true")
@@ -98,15 +99,30 @@ def load(args: argparse.Namespace) -> tuple[VtDp3Policy, tuple[Any, Any], LeRobo
     return policy, make_pre_post_processors(config, dataset_stats=dataset.meta.stats), dataset  # ty: ignore
 
 
+def settings(text: str) -> dict[str, Any]:
+    """Settings by name, as a flag's JSON."""
+    try:
+        given = json.loads(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(f"{text} is not valid JSON ({error})") from error
+    if not isinstance(given, dict):
+        raise argparse.ArgumentTypeError(f"give settings by name, such as '{{\"horizon\": 8}}', got {text}")
+    return given
+
+
 def make_parser() -> CommandParser:
     """The command line."""
     parser = CommandParser(description=__doc__)
     parser.add_argument("--dataset", type=Path, required=True, help="folder of the demonstrations")
-    parser.add_argument("--policy", default="{}", help="settings that differ from vt_dp3_pads.yaml, as JSON")
-    parser.add_argument("--steps", type=int, default=6000, help="default %(default)s")
-    parser.add_argument("--batch_size", type=int, default=128, help="default %(default)s")
-    parser.add_argument("--passes", type=int, default=4, help="times that the encoder sees every frame")
-    parser.add_argument("--seed", type=int, default=0, help="default %(default)s")
+    parser.add_argument(
+        "--policy", type=settings, default={}, help="settings that differ from vt_dp3_pads.yaml, as JSON"
+    )
+    parser.add_argument("--steps", type=at_least(1), default=6000, help="default %(default)s")
+    parser.add_argument("--batch_size", type=at_least(1), default=128, help="default %(default)s")
+    parser.add_argument(
+        "--passes", type=at_least(1), default=4, help="times that the encoder sees every frame"
+    )
+    parser.add_argument("--seed", type=at_least(0), default=0, help="default %(default)s")
     parser.add_argument("--device", default="cpu", help="cpu or cuda")
     parser.add_argument("--output_dir", type=Path, required=True, help="of pretrained_model")
     return parser
@@ -117,10 +133,13 @@ def main() -> None:
     """Writes the policy with its processors."""
     args = make_parser().parse_args()
     check_device(args.device)
+    check_folder("--output_dir", args.output_dir)
+    folder = args.output_dir / "pretrained_model"
+    if folder.exists():
+        raise FileExistsError(f"{folder} exists; choose another --output_dir or remove it")
     set_seed(args.seed)
     policy, processors, dataset = load(args)
     loss = clone(policy, perceived(policy, processors[0], dataset, args.passes), args.steps, args.batch_size)
-    folder = args.output_dir / "pretrained_model"
     for part in (policy, *processors):
         part.save_pretrained(folder)
     print(f"last loss {loss:.4f}; policy: {folder}")

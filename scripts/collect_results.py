@@ -60,6 +60,8 @@ def main() -> None:
         else:
             task = options.task or source.resolve().parent.name
             found += run_rows(source, {"table": options.table, "task": task} | given, origin)
+    if not found:
+        raise ValueError(f"no rows for {options.table} in {', '.join(map(str, options.sources))}")
     path = options.results or RESULTS / f"{options.table}.json"
     save(path, found, replace=options.replace)
     unknown = sum(row.commit is None for row, _ in found)

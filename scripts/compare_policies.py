@@ -25,7 +25,7 @@ from lerobot_vtrefine.cli.pipeline.stages import Stage, StageRunner, evaluation_
 from lerobot_vtrefine.cli.report.results import load_evaluation
 from lerobot_vtrefine.cli.results.provenance import provenance
 from lerobot_vtrefine.cli.results.rows import Run
-from lerobot_vtrefine.cli.results.store import save
+from lerobot_vtrefine.cli.results.store import check_results, save
 from lerobot_vtrefine.finetune.distributed import check_device
 from lerobot_vtrefine.shipped import PREFIX, find
 
@@ -166,6 +166,7 @@ def main() -> None:
     """Run what is not done yet; every evaluation becomes a row as soon as it is there."""
     options = make_parser().parse_args()
     find("--config_path", options.task)  # a misspelt name is told now
+    check_results("--results", options.results)
     check_device(options.device)
     record = record_stage(options)
     StageRunner(options.output_dir, [record]).run()

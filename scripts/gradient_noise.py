@@ -25,7 +25,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from lerobot_vtrefine.cli.arguments import CommandParser
+from lerobot_vtrefine.cli.arguments import CommandParser, at_least
 from lerobot_vtrefine.cli.errors import run_cli
 from lerobot_vtrefine.finetune import dppo
 from lerobot_vtrefine.finetune.chains import chain_log_probs
@@ -145,11 +145,11 @@ def main() -> None:
     parser = CommandParser(description=__doc__)
     parser.add_argument("--policy", type=Path, required=True, help="an imitation-learned vt_dp3's folder")
     parser.add_argument("--task", type=Path, required=True, help="a file as in configs/env")
-    parser.add_argument("--worlds", type=int, default=1024, help="episodes of an iteration")
+    parser.add_argument("--worlds", type=at_least(1), default=1024, help="episodes of an iteration")
     parser.add_argument("--device", default="cpu", help="of simulation and policy: cpu or cuda")
     parser.add_argument("--std", type=float, help="of the exploration noise; default: the preset's")
     parser.add_argument("--nats", type=float, help="an iteration's way, per decision; default: the preset's")
-    parser.add_argument("--seed", type=int, default=0, help="of the first episode")
+    parser.add_argument("--seed", type=at_least(0), default=0, help="of the first episode")
     parser.add_argument("--deployed", action="store_true", help="judge the deployed policy too")
     print(json.dumps(measure(parser.parse_args()), indent=2))
 

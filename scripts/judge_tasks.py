@@ -21,7 +21,7 @@ from lerobot_vtrefine.cli.errors import run_cli
 from lerobot_vtrefine.cli.results.cells import percent, share
 from lerobot_vtrefine.cli.results.collect import origin_of
 from lerobot_vtrefine.cli.results.rows import Line
-from lerobot_vtrefine.cli.results.store import save
+from lerobot_vtrefine.cli.results.store import check_results, save
 from lerobot_vtrefine.information import estimator
 from lerobot_vtrefine.information.contact import SIDE
 
@@ -87,6 +87,7 @@ def main() -> None:
         "--outputs", type=Path, default=Path("outputs"), help="folder of the studies (default: %(default)s)"
     )
     options, extra = parser.parse_known_args()
+    check_results("--results", options.results)
     for task in options.tasks:
         folder = options.outputs / f"information_{task}"
         if not (folder / "information.json").is_file():

@@ -21,7 +21,7 @@ from lerobot_vtrefine.cli.arguments import CommandParser
 from lerobot_vtrefine.cli.errors import run_cli
 from lerobot_vtrefine.cli.results.provenance import provenance
 from lerobot_vtrefine.cli.results.rows import Run, read_rows
-from lerobot_vtrefine.cli.results.store import save
+from lerobot_vtrefine.cli.results.store import check_results, save
 from lerobot_vtrefine.embodiments import get_embodiment
 from lerobot_vtrefine.embodiments.embodiment import STARTS
 from lerobot_vtrefine.sim.config import MESH_PAIR_PREFIX, PROCEDURAL_PAIRS, SceneConfig
@@ -123,6 +123,7 @@ def main() -> None:
     parser.add_argument("--mesh_dir", type=Path, help="folder of meshes for automate/ID")
     parser.add_argument("--results", type=Path, default=RESULTS / f"{TABLE}.json", help="file of the rows")
     options = parser.parse_args()
+    check_results("--results", options.results)
     if options.episodes < 1:
         raise ValueError(f"--episodes must be at least 1, got {options.episodes}")
     for body in options.bodies:

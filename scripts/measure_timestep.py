@@ -11,12 +11,12 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from lerobot_vtrefine.cli.arguments import CommandParser, read_list
+from lerobot_vtrefine.cli.arguments import CommandParser, ListAction, at_least
 from lerobot_vtrefine.cli.errors import run_cli
 from lerobot_vtrefine.cli.results.cells import share
 from lerobot_vtrefine.cli.results.provenance import provenance
 from lerobot_vtrefine.cli.results.rows import Line
-from lerobot_vtrefine.cli.results.store import save
+from lerobot_vtrefine.cli.results.store import check_results, save
 from lerobot_vtrefine.finetune.config import TrustRegionDppo
 from lerobot_vtrefine.finetune.evaluation import evaluate
 from lerobot_vtrefine.finetune.pipeline import load_practice
@@ -56,20 +56,25 @@ def main() -> None:
     """Step by step; each is a row as soon as it is measured."""
     parser = CommandParser(description=__doc__)
     parser.add_argument(
-        "--timesteps_s", type=read_list, default=[0.001, 0.002, 0.0025, 0.005], help="default: %(default)s"
+        "--timesteps_s",
+        action=ListAction,
+        kind=float,
+        default=[0.001, 0.002, 0.0025, 0.005],
+        help="default: %(default)s",
     )
     parser.add_argument("--task", default="square_grasped_1mm", help="a name of configs/env")
     parser.add_argument("--policy", default="square_grasped_1mm", help="that comes with the package")
-    parser.add_argument("--episodes", type=int, default=256, help="per step")
+    parser.add_argument("--episodes", type=at_least(1), default=256, help="per step")
     parser.add_argument("--backend", choices=["batch", "warp"], default="batch", help="default: %(default)s")
     parser.add_argument("--device", default="cpu", help="of policy and, with warp, simulation: cpu or cuda")
     parser.add_argument(
         "--results", type=Path, default=ROOT / "results" / f"{TABLE}.json", help="file of the rows"
     )
     options = parser.parse_args()
+    check_results("--results", options.results)
     task, policy = find("--config_path", options.task), find("--policy.path", options.policy)
     for timestep_s in tqdm(options.timesteps_s):
-        row = measure(policy, task, float(timestep_s), options.episodes, options.backend, options.device)
+        row = measure(policy, task, timestep_s, options.episodes, options.backend, options.device)
         save(options.results, [(row, [])], replace=False)
 
 

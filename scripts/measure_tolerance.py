@@ -14,12 +14,12 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
-from lerobot_vtrefine.cli.arguments import CommandParser
+from lerobot_vtrefine.cli.arguments import CommandParser, at_least
 from lerobot_vtrefine.cli.errors import run_cli
 from lerobot_vtrefine.cli.results.cells import share
 from lerobot_vtrefine.cli.results.provenance import provenance
 from lerobot_vtrefine.cli.results.rows import Line
-from lerobot_vtrefine.cli.results.store import save
+from lerobot_vtrefine.cli.results.store import check_results, save
 from lerobot_vtrefine.finetune.pipeline import env_of
 from lerobot_vtrefine.information.tolerance import LATERAL, SIZES, Tolerated, tolerance
 from lerobot_vtrefine.shipped import find
@@ -42,12 +42,13 @@ def main() -> None:
     """Task by task; each is a row as soon as it is measured."""
     parser = CommandParser(description=__doc__)
     parser.add_argument("tasks", nargs="+", help="files of configs/env")
-    parser.add_argument("--episodes", type=int, default=256, help="per size of an error")
-    parser.add_argument("--num_envs", type=int, default=64, help="simulations side by side")
+    parser.add_argument("--episodes", type=at_least(1), default=256, help="per size of an error")
+    parser.add_argument("--num_envs", type=at_least(1), default=64, help="simulations side by side")
     parser.add_argument("--mesh_dir", type=Path, help="folder of the meshes, for pairs from meshes")
     parser.add_argument("--backend", choices=["batch", "warp"], default="batch", help="default: %(default)s")
     parser.add_argument("--results", type=Path, default=RESULTS / f"{TABLE}.json", help="file of the rows")
     options = parser.parse_args()
+    check_results("--results", options.results)
     for task in options.tasks:
         env = env_of(find("--config_path", task))
         config = replace(env, backend=options.backend, mesh_dir=options.mesh_dir or env.mesh_dir)

@@ -27,8 +27,9 @@ import numpy as np
 import torch
 
 import lerobot_vtrefine
-from lerobot_vtrefine.cli.arguments import CommandParser, read_list
+from lerobot_vtrefine.cli.arguments import CommandParser, ListAction, at_least
 from lerobot_vtrefine.cli.errors import run_cli
+from lerobot_vtrefine.cli.outputs import check_file
 from lerobot_vtrefine.envs.decisions import LeRobotDecisionEnv
 from lerobot_vtrefine.envs.episodes import Episodes
 from lerobot_vtrefine.finetune import dppo
@@ -146,18 +147,22 @@ def main() -> None:
     """Prints a JSON object per number of worlds."""
     parser = CommandParser(description=__doc__)
     parser.add_argument("--device", default="cpu", help="of simulation and policy: cpu or cuda")
-    parser.add_argument("--worlds", type=read_list, default=[1024, 4096], help="numbers of worlds")
-    parser.add_argument("--iterations", type=int, default=4, help="measured, after one to warm up")
-    parser.add_argument("--decisions", type=int, default=0, help="of a rollout; 0: whole episodes")
+    parser.add_argument(
+        "--worlds", action=ListAction, kind=at_least(1), default=[1024, 4096], help="numbers of worlds"
+    )
+    parser.add_argument("--iterations", type=at_least(1), default=4, help="measured, after one to warm up")
+    parser.add_argument("--decisions", type=at_least(0), default=0, help="of a rollout; 0: whole episodes")
     parser.add_argument("--policy", type=Path, default=POLICY, help="a vt_dp3 checkpoint's folder")
     parser.add_argument("--task", type=Path, default=TASK, help="a file as in configs/env")
     parser.add_argument("--timestep_s", type=float, help="longest physics step [s], default: the task's")
     parser.add_argument("--json", type=Path, help="where to write the rows, too")
     args = parser.parse_args()
+    if args.json is not None:
+        check_file("--json", args.json)
     print(f"measuring {Path(lerobot_vtrefine.__file__).parent}", flush=True)
     rows = []
     for worlds in args.worlds:
-        rows.append(profile(args, int(worlds)))
+        rows.append(profile(args, worlds))
         print(json.dumps(rows[-1], indent=2), flush=True)
     if args.json is not None:
         args.json.write_text(json.dumps(rows, indent=2) + "\n", encoding="utf-8")

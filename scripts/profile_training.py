@@ -18,8 +18,10 @@ from typing import Any
 
 import numpy as np
 
-from lerobot_vtrefine.cli.arguments import CommandParser
+from lerobot_vtrefine.choices import check_choice
+from lerobot_vtrefine.cli.arguments import CommandParser, at_least
 from lerobot_vtrefine.cli.errors import run_cli
+from lerobot_vtrefine.cli.outputs import check_file
 from lerobot_vtrefine.cli.pipeline.stages import end, own_sessions
 from lerobot_vtrefine.finetune.distributed import check_device
 from lerobot_vtrefine.lerobot_compat.benchmark import record_noise
@@ -77,18 +79,25 @@ def main() -> None:
     parser = CommandParser(description=__doc__)
     parser.add_argument("--device", default="cpu", help="cpu or cuda")
     parser.add_argument("--policies", default=",".join(POLICIES), help=f"of {', '.join(POLICIES)}")
-    parser.add_argument("--steps", type=int, default=1000, help="default %(default)s")
-    parser.add_argument("--batch_size", type=int, default=128, help="default %(default)s")
-    parser.add_argument("--num_workers", type=int, default=4, help="of the data loader; LeRobot's default")
-    parser.add_argument("--episodes", type=int, default=20, help="of the dataset, 50 frames each")
+    parser.add_argument("--steps", type=at_least(1), default=1000, help="default %(default)s")
+    parser.add_argument("--batch_size", type=at_least(1), default=128, help="default %(default)s")
+    parser.add_argument(
+        "--num_workers", type=at_least(0), default=4, help="of the data loader; LeRobot's default"
+    )
+    parser.add_argument("--episodes", type=at_least(1), default=20, help="of the dataset, 50 frames each")
     parser.add_argument("--json", type=Path, help="where to write the rows, too")
     args = parser.parse_args()
     check_device(args.device)
+    names = args.policies.split(",")
+    for name in names:
+        check_choice("--policies", name, POLICIES)
+    if args.json is not None:
+        check_file("--json", args.json)
     rows = []
     with tempfile.TemporaryDirectory() as folder:
         root = Path(folder) / "frames"
         record_noise(root, args.episodes, FRAMES)
-        for name in args.policies.split(","):
+        for name in names:
             rows.append(train(name, root, args))
             print(json.dumps(rows[-1]), flush=True)
     if args.json is not None:

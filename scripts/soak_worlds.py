@@ -23,11 +23,14 @@ from typing import Any
 import numpy as np
 import torch
 
-from lerobot_vtrefine.cli.arguments import CommandParser
+from lerobot_vtrefine.choices import check_choice
+from lerobot_vtrefine.cli.arguments import CommandParser, at_least
 from lerobot_vtrefine.cli.errors import run_cli
+from lerobot_vtrefine.cli.outputs import check_file
 from lerobot_vtrefine.embodiments.embodiment import STARTS
 from lerobot_vtrefine.envs import VtRefineEnvConfig
 from lerobot_vtrefine.envs.episodes import Episodes
+from lerobot_vtrefine.files import read_json_lines
 from lerobot_vtrefine.finetune import dppo
 from lerobot_vtrefine.finetune.config import TrustRegionDppo
 from lerobot_vtrefine.finetune.pipeline import Practice, make_practice
@@ -61,6 +64,9 @@ def main() -> int:
     """Goes on where the rows end."""
     options = parse()
     kinds = options.actions.split(",")
+    for kind in kinds:
+        check_choice("--actions", kind, ACTIONS)
+    check_file("--rows", options.rows)
     places = [(pair, start) for pair in options.pairs.split(",") for start in options.starts.split(",")]
     share = options.control_steps / len(places)
     rows, deadline = read(options.rows), time.perf_counter() + 60 * options.minutes
@@ -71,7 +77,6 @@ def main() -> int:
         for row in soak(pair, start, missing, deadline, options):
             rows.append(row)
             print(json.dumps(row), file=sys.stderr, flush=True)
-            options.rows.parent.mkdir(parents=True, exist_ok=True)
             with options.rows.open("a", encoding="utf-8") as file:
                 file.write(json.dumps(row) + "\n")
         gc.collect()
@@ -89,8 +94,10 @@ def main() -> int:
 def parse() -> argparse.Namespace:
     """The command line."""
     parser = CommandParser(description=__doc__)
-    parser.add_argument("--worlds", type=int, default=64, help="default %(default)s")
-    parser.add_argument("--control_steps", type=int, default=100_000, help="of each kind of actions, in all")
+    parser.add_argument("--worlds", type=at_least(1), default=64, help="default %(default)s")
+    parser.add_argument(
+        "--control_steps", type=at_least(1), default=100_000, help="of each kind of actions, in all"
+    )
     parser.add_argument("--minutes", type=float, default=60.0, help="begin nothing new after these")
     parser.add_argument("--rows", type=Path, default=Path("outputs/soak.jsonl"), help="where rows are kept")
     parser.add_argument("--pairs", default=",".join(PROCEDURAL_PAIRS), help="default: %(default)s")
@@ -104,15 +111,15 @@ def parse() -> argparse.Namespace:
     parser.add_argument("--backend", default="warp", help="default: %(default)s")
     parser.add_argument("--solver", default="own", help="of the warp backend")
     parser.add_argument("--device", default="auto", help="of the warp backend and the policy")
-    parser.add_argument("--seed", type=int, default=0, help="of the first episode (default %(default)s)")
+    parser.add_argument(
+        "--seed", type=at_least(0), default=0, help="of the first episode (default %(default)s)"
+    )
     return parser.parse_args()
 
 
 def read(path: Path) -> list[Row]:
     """Rows of earlier calls."""
-    return (
-        [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()] if path.is_file() else []
-    )
+    return read_json_lines(path) if path.is_file() else []
 
 
 def done(rows: list[Row], pair: str, start: str, actions: str) -> int:

@@ -21,11 +21,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from lerobot_vtrefine.cli.arguments import CommandParser
+from lerobot_vtrefine.cli.arguments import CommandParser, at_least
 from lerobot_vtrefine.cli.errors import run_cli
 from lerobot_vtrefine.cli.results.provenance import provenance
 from lerobot_vtrefine.cli.results.rows import Line
-from lerobot_vtrefine.cli.results.store import save
+from lerobot_vtrefine.cli.results.store import check_results, save
 from lerobot_vtrefine.finetune import dppo
 from lerobot_vtrefine.finetune.chains import chain_log_probs, decision_kl
 from lerobot_vtrefine.finetune.config import DppoConfig, TrustRegionDppo
@@ -129,7 +129,7 @@ def main() -> None:
     parser = CommandParser(description=__doc__)
     parser.add_argument("--policy", type=Path, required=True, help="an imitation-learned vt_dp3's folder")
     parser.add_argument("--task", type=Path, required=True, help="a file as in configs/env")
-    parser.add_argument("--worlds", type=int, default=128, help="episodes of an iteration")
+    parser.add_argument("--worlds", type=at_least(1), default=128, help="episodes of an iteration")
     parser.add_argument(
         "--rates",
         type=float,
@@ -139,9 +139,11 @@ def main() -> None:
     )
     parser.add_argument("--std", type=float, default=TrustRegionDppo.min_sampling_std, help="of exploration")
     parser.add_argument("--device", default="cpu", help="of simulation and policy: cpu or cuda")
-    parser.add_argument("--seed", type=int, default=0, help="of the first episode")
+    parser.add_argument("--seed", type=at_least(0), default=0, help="of the first episode")
     parser.add_argument("--results", type=Path, help="where rows of the table step_mm go, too")
     args = parser.parse_args()
+    if args.results:
+        check_results("--results", args.results)
     for row in measure(args):
         print(json.dumps(row), flush=True)
         if args.results:

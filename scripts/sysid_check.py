@@ -23,6 +23,7 @@ import numpy as np
 from lerobot_vtrefine.cli import import_dataset
 from lerobot_vtrefine.cli.arguments import CommandParser
 from lerobot_vtrefine.cli.errors import run_cli
+from lerobot_vtrefine.cli.outputs import check_file
 from lerobot_vtrefine.diagnose.recordings import read_recording_set
 from lerobot_vtrefine.diagnose.servo.bench import GRAVITY_M_S2, Bench
 from lerobot_vtrefine.diagnose.servo.parameters import INDEX
@@ -231,6 +232,7 @@ def main() -> None:
         help="file of the table (default: %(default)s)",
     )
     options = parser.parse_args()
+    check_file("--output", options.output)
     logging.disable(logging.WARNING)
     with tempfile.TemporaryDirectory() as name:
         bench, truth = generated(Path(name))
@@ -238,7 +240,6 @@ def main() -> None:
         columns |= {"generated: ours": by_the_baseline(bench), "generated: mujoco.sysid": by_mujoco(bench)}
         bench = real(Path(name))
         columns |= {"XL330: ours": by_the_baseline(bench), "XL330: mujoco.sysid": by_mujoco(bench)}
-    options.output.parent.mkdir(parents=True, exist_ok=True)
     options.output.write_text(table(columns) + "\n", encoding="utf-8")
     print(table(columns))
 

@@ -1,7 +1,7 @@
 """Command lines: the parser of commands and scripts without a configuration file, and flags from settings."""
 
 import argparse
-from collections.abc import Container, Iterable, Mapping
+from collections.abc import Callable, Container, Iterable, Mapping
 from typing import Any, override
 
 import yaml
@@ -28,7 +28,7 @@ class CommandParser(argparse.ArgumentParser):
 class ListAction(argparse.Action):
     """A flag with a list: ``--ports='[a, b]'``, or values in a row, as a shell's ``*`` gives them."""
 
-    def __init__(self, *args: Any, kind: type = str, **settings: Any) -> None:
+    def __init__(self, *args: Any, kind: Callable[[Any], Any] = str, **settings: Any) -> None:
         super().__init__(*args, nargs="+", **settings)
         self._kind = kind
 
@@ -45,6 +45,21 @@ class ListAction(argparse.Action):
             setattr(namespace, self.dest, [self._kind(item) for item in items])
         except (argparse.ArgumentTypeError, ValueError, TypeError) as error:
             raise argparse.ArgumentError(self, str(error)) from error
+
+
+def at_least(lowest: int) -> Callable[[str], int]:
+    """What a flag with whole numbers from ``lowest`` on takes, as its ``type``."""
+
+    def read(text: str) -> int:
+        try:
+            number = int(text)
+        except ValueError:
+            number = None
+        if number is None or number < lowest:
+            raise argparse.ArgumentTypeError(f"give a whole number of at least {lowest}, got {text!r}")
+        return number
+
+    return read
 
 
 def read_list(text: str) -> list[Any]:

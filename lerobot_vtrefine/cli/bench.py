@@ -93,10 +93,15 @@ class BenchConfig:
         unknown = sorted(set(self.parts) - set(PARTS))
         if unknown:
             raise ValueError(f"--parts: unknown {', '.join(unknown)}; choose from {', '.join(PARTS)}")
+        for name in ("parts", "solver"):
+            if not getattr(self, name):
+                raise ValueError(f"--{name} is empty; leave it out for its default")
         if not self.limit_s > 0:
             raise ValueError(f"--limit_s must be above 0, got {self.limit_s}")
         if self.plot and self.device is not None:
             raise ValueError("--plot and --device are two different things to do; give one")
+        if self.plot and self.json is not None:
+            raise ValueError("--plot has no rows for --json; leave out one of them")
         for solver in self.solver:
             check_choice("--solver", solver, WARP_SOLVERS)
         if min(self.worlds, default=0) < 1:

@@ -35,6 +35,7 @@ def check_arguments(flags: Sequence[Flag], arguments: Sequence[str]) -> None:
         FileNotFoundError: a file or folder is not there.
     """
     _check_known(flags, arguments)
+    _check_groups(flags, arguments)
     _check_places(arguments)
     _check_plugins(arguments)
     _check_required(flags, arguments)
@@ -56,6 +57,20 @@ def _check_known(flags: Sequence[Flag], arguments: Sequence[str]) -> None:
         below = [inner.name for f in flags if f.group for inner in flags_of(*f.group, f"{f.name}.")]
         message = f"unrecognized arguments: {argument}"
         raise ValueError(message + meant(message, [f"--{name}" for name in [*sorted(known), *below]]))
+
+
+def _check_groups(flags: Sequence[Flag], arguments: Sequence[str]) -> None:
+    """Flags with settings by name; the parser's own words for others are a traceback's."""
+    for name in (flag.name for flag in flags if flag.type.startswith("dict")):
+        for given in values_of(f"--{name}", arguments):
+            try:
+                settings = yaml.safe_load(given)
+            except yaml.YAMLError:
+                settings = None
+            if not isinstance(settings, dict) and given != "null":
+                raise ValueError(
+                    f"--{name}={given}: give settings by name, such as --{name}='{{name: value}}'"
+                )
 
 
 def _check_places(arguments: Sequence[str]) -> None:

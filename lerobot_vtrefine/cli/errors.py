@@ -215,9 +215,10 @@ def run_cli[**P](main: Callable[P, int | None]) -> Callable[P, int]:
 
     ``ValueError``, ``OSError`` (missing files, full disk), ``ImportError`` (an extra is not installed),
     ``FloatingPointError`` (training that diverged), draccus' parsing errors, and too little memory, of a GPU
-    or not, are expected; anything else is a defect and keeps its traceback. Ctrl-C exits with 130, as `exit_status` says;
-    where ``head`` has seen enough, a command ends without a word, and with the status of a command that it
-    ran where that one failed. With ``VTREFINE_DEBUG=1`` in the environment every error keeps its traceback.
+    or not, are expected; anything else is a defect and keeps its traceback. Ctrl-C exits with 130, as
+    `exit_status` says; where ``head`` has seen enough, a command ends without a word, and with the status of
+    a command that it ran where that one failed. With ``VTREFINE_DEBUG=1`` in the environment every error
+    keeps its traceback.
     """
 
     @functools.wraps(main)

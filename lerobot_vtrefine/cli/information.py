@@ -19,6 +19,7 @@ from lerobot_vtrefine.cli.outputs import OVERWRITE, staged
 from lerobot_vtrefine.cli.results.provenance import write_provenance
 from lerobot_vtrefine.envs import VtRefineEnvConfig
 from lerobot_vtrefine.envs.config import checked_env
+from lerobot_vtrefine.finetune.distributed import check_device
 from lerobot_vtrefine.information.contact import SIDE, TOUCHING
 from lerobot_vtrefine.information.estimator import POLICY, SENSES
 from lerobot_vtrefine.information.page import render_page
@@ -97,6 +98,7 @@ def summary(found: Study) -> str:
 def information(cfg: InformationConfig) -> None:
     """Study one task and write what was found."""
     env = checked_env(cfg.env)
+    check_device(cfg.effort.device, "--effort.device")
     with staged(cfg.output_dir, FILES, overwrite=cfg.overwrite, flag=OVERWRITE) as folder:
         found = study(env, cfg.senses, cfg.effort, Bars(), save_keeper(folder, cfg.effort))
         write(found, cfg.effort, folder)

@@ -6,7 +6,7 @@ from lerobot.configs import PreTrainedConfig, parser
 
 from lerobot_vtrefine.finetune.config import DppoConfig
 from lerobot_vtrefine.finetune.protocols import Agent
-from lerobot_vtrefine.lerobot_compat.local_places import CONFIG, damaged_settings
+from lerobot_vtrefine.lerobot_compat.local_places import damaged_settings
 from lerobot_vtrefine.policies.vt_dp3.configuration_vt_dp3 import VtDp3Config
 from lerobot_vtrefine.policies.vt_dp3.modeling_vt_dp3 import VtDp3Policy
 
@@ -26,7 +26,7 @@ def load_policy(path: Path, overrides: list[str] | None = None) -> VtDp3Policy:
     """
     if overrides is None:
         overrides = parser.get_yaml_overrides("policy") + (parser.get_cli_overrides("policy") or [])
-    if (path / CONFIG).is_file() and (problem := damaged_settings(path)):
+    if problem := damaged_settings(path):
         raise ValueError(problem)
     try:
         config = PreTrainedConfig.from_pretrained(path, cli_overrides=overrides)

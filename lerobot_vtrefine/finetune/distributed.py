@@ -11,10 +11,16 @@ import torch.distributed as dist
 from torch import Tensor, nn
 
 
-def check_device(device: str) -> None:
-    """Raises: ValueError for a GPU where there is none: LeRobot would go on, on the CPU, for days."""
+def check_device(device: str, flag: str = "--device") -> None:
+    """Raises: ValueError for a name of no device, and for a GPU where there is none: LeRobot would go on, on
+    the CPU, for days.
+    """
+    try:
+        torch.device(device)
+    except RuntimeError as error:
+        raise ValueError(f"{flag}={device} is unknown; give cpu or cuda") from error
     if device.startswith("cuda") and not torch.cuda.is_available():
-        raise ValueError(f"--device={device}: no CUDA GPU with a driver here; --device=cpu takes far longer")
+        raise ValueError(f"{flag}={device}: no CUDA GPU with a driver here; {flag}=cpu takes far longer")
 
 
 def claim_gpu() -> None:

@@ -15,6 +15,7 @@ YES = ("true", "yes", "y", "on", "1")
 TAKING_POLICIES = ("lerobot-train", "lerobot-eval", "lerobot-rollout")
 POLICY_PATH = "--policy.path"
 CONFIG = "config.json"
+PROCESSORS = ("policy_preprocessor.json", "policy_postprocessor.json")
 BELOW = ("pretrained_model", "checkpoints/last/pretrained_model")
 """Where a policy lies in the folder of a checkpoint, and of a run."""
 
@@ -103,13 +104,16 @@ def misnamed_policy(folder: Path) -> str:
 
 
 def damaged_settings(folder: Path) -> str:
-    """Why a policy's own folder has no settings to be read, of which LeRobot tells no file; or nothing."""
-    try:
-        settings = json.loads((folder / CONFIG).read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        return f"{folder}: {CONFIG} is not valid JSON ({error})"
-    if not isinstance(settings, dict):
-        return f"{folder}: {CONFIG} does not hold settings by name"
+    """Which settings of a policy's own folder cannot be read, of which LeRobot tells no file; or nothing."""
+    for file in (CONFIG, *PROCESSORS):
+        if not (folder / file).is_file():
+            continue
+        try:
+            settings = json.loads((folder / file).read_text(encoding="utf-8"))
+        except (OSError, ValueError) as error:
+            return f"{folder}: {file} is not valid JSON ({error})"
+        if not isinstance(settings, dict):
+            return f"{folder}: {file} does not hold settings by name"
     return ""
 
 

@@ -20,6 +20,7 @@ os.environ["OMP_NUM_THREADS"] = os.environ["MKL_NUM_THREADS"] = "1"
 import numpy as np
 from tqdm import tqdm
 
+from lerobot_vtrefine.cli.arguments import at_least
 from lerobot_vtrefine.cli.results.provenance import write_provenance
 from lerobot_vtrefine.interrupts import ends_like_ctrl_c
 
@@ -31,7 +32,7 @@ def add_arguments(parser: argparse.ArgumentParser, folder: Path) -> None:
     """How to run: --jobs, --minutes, --output_dir, --table."""
     parser.add_argument(
         "--jobs",
-        type=int,
+        type=at_least(1),
         default=os.cpu_count() or 1,
         help="processes of one core each (default: all cores)",
     )

@@ -96,6 +96,9 @@ def test_processor_time_is_that_of_one_thread(monkeypatch: pytest.MonkeyPatch, t
         (["--plot", "--device=cpu"], "--plot and --device are two different things"),
         (["--device=tpu"], "warp.device must be auto, cpu, cuda or cuda:0, not 'tpu'"),
         (["--json=/"], "--json=/ is a folder; name a file in it"),
+        (["--plot", "--json=x.json"], "--plot has no rows for --json"),
+        (["--parts=[]"], "--parts is empty; leave it out for its default"),
+        (["--device=cpu", "--solver=[]"], "--solver is empty; leave it out for its default"),
         (["--limit_s=0"], "--limit_s must be above 0"),
         (
             ["--device=cpu", "--solver=[own, theirs]"],

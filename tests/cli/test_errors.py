@@ -214,7 +214,9 @@ def test_a_gpu_without_memory_is_one_line(error: Exception, capsys) -> None:
     [
         MemoryError(),
         ValueError("std::bad_alloc"),  # MuJoCo's
-        RuntimeError("[enforce fail at alloc_cpu.cpp:117] . DefaultCPUAllocator: can't allocate memory: 8 GB"),
+        RuntimeError(
+            "[enforce fail at alloc_cpu.cpp:117] . DefaultCPUAllocator: can't allocate memory: 8 GB"
+        ),
     ],
     ids=["NumPy", "MuJoCo", "torch"],
 )

@@ -182,7 +182,21 @@ def test_a_flag_may_stand_in_a_file_or_name_what_lies_below_it(tmp_path: Path) -
             ["--output_dir=/etc/hosts/run"],
             "/etc/hosts/run cannot be written: /etc/hosts is a file",
         ),
-        (launch.play, ["--policy.path="], "--policy.path= names nothing; give a file or a folder, or leave it out"),
+        (
+            launch.demo,
+            ["--env={pair"],
+            "--env={pair: give settings by name, such as --env='{name: value}'",
+        ),
+        (
+            launch.import_dataset,
+            ["--pads=primary"],
+            "--pads=primary: give settings by name, such as --pads='{name: value}'",
+        ),
+        (
+            launch.play,
+            ["--policy.path="],
+            "--policy.path= names nothing; give a file or a folder, or leave it out",
+        ),
     ],
 )
 def test_what_is_wrong_with_a_command_line_is_told_before_lerobot_is_loaded(
@@ -402,6 +416,9 @@ def test_a_policy_that_is_not_there_is_named(monkeypatch, tmp_path: Path) -> Non
     assert told(str(own)).startswith(f"error: {own}: config.json is not valid JSON (Expecting")
     (own / "config.json").write_text("[]")
     assert told(str(own)) == f"error: {own}: config.json does not hold settings by name"
+    (own / "config.json").write_text("{}")
+    (own / "policy_preprocessor.json").write_text("{")
+    assert told(str(own)).startswith(f"error: {own}: policy_preprocessor.json is not valid JSON (Expecting")
 
 
 def test_without_a_network_a_policy_of_the_hub_is_asked_for_once(monkeypatch, tmp_path: Path) -> None:

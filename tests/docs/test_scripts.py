@@ -8,6 +8,8 @@ import pytest
 from command_uses import uses
 from loaded_process import LoadedProcess
 
+from lerobot_vtrefine.diagnose.template import write_template
+
 ROOT = Path(__file__).parents[2]
 SCRIPTS = ROOT / "scripts"
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -31,6 +33,78 @@ for path in json.loads(paths):
     found[path] = [status, out.getvalue()]
 print(json.dumps(found))
 """
+
+
+COMPLAIN = """
+import contextlib, io, json, runpy, sys
+_, calls, *sys.path[:0] = sys.argv
+found = []
+for call in json.loads(calls):
+    sys.argv = call
+    errors = io.StringIO()
+    with contextlib.redirect_stderr(errors), contextlib.redirect_stdout(io.StringIO()):
+        try:
+            status = runpy.run_path(call[0], run_name="__main__") and None
+        except SystemExit as stop:
+            status = stop.code
+    found.append([status, errors.getvalue()])
+print(json.dumps(found))
+"""
+TASK = "--config_path=configs/env/round_grasped.yaml"
+BAD = {
+    f"before_after {TASK} --before=x --after=x --output=FILE/x.gif": "--output=FILE/x.gif cannot be written",
+    f"before_after {TASK} --before=x --after=x --output=x.gif --episodes=0": "argument --episodes: give",
+    "bench_diagnose --per_cell=0": "argument --per_cell: give a whole number of at least 1, got '0'",
+    "bench_jittered --seeds=2": "argument --seeds: give the first and the last + 1, such as 0:2, got '2'",
+    "bench_jittered --seeds=2:1": "argument --seeds: give the first and the last + 1",
+    "bench_jittered --gains=nan": "argument --gains: give numbers between 0 and 1",
+    "bench_jittered --pad=0x0": "argument --pad: give rows and columns, such as 12x32, got '0x0'",
+    "bench_jittered --jobs=0": "argument --jobs: give a whole number of at least 1, got '0'",
+    "bench_outsider --sets=-1": "argument --sets: give a whole number of at least 1, got '-1'",
+    "bench_servo --recording=PADS --output_dir=NEW": "--recording=PADS is not of a servo with a known load",
+    "clone_on_features --dataset=x --output_dir=OLD": "OLD/pretrained_model exists; choose",
+    "clone_on_features --dataset=x --output_dir=NEW --policy={": "argument --policy: { is not valid JSON",
+    "clone_on_features --dataset=x --output_dir=NEW --policy=[1]": "argument --policy: give settings by name",
+    "clone_on_features --dataset=x --output_dir=NEW --device=tpu": "--device=tpu is unknown; give",
+    "collect_results reality NEW --results=NEW/rows.json": "no rows for reality in NEW",
+    "judge_tasks round_grasped --results=FILE": "FILE: no JSON",
+    "measure_tolerance round_grasped --results=FILE": "FILE: no JSON",
+    "measure_timestep --results=FILE": "FILE: no JSON",
+    "measure_timestep --timesteps_s=a": "argument --timesteps_s: ",
+    "profile_training --policies=nosuch": "--policies=nosuch is unknown; choose from small, pads, paper",
+    "profile_training --json=FILE/x": "--json=FILE/x cannot be written: FILE is not a folder",
+    "profile_finetuning --worlds=a": "argument --worlds: give a whole number of at least 1, got 'a'",
+    "profile_finetuning --json=FILE/x": "--json=FILE/x cannot be written: FILE is not a folder",
+    "soak_worlds --actions=nosuch": "--actions=nosuch is unknown; choose from random, trained, expert",
+    "soak_worlds --rows=FILE": "FILE, line 1: not valid JSON",
+    "step_in_millimetres --policy=x --task=x --results=FILE": "FILE: no JSON",
+    "sysid_check --output=FILE/x": "--output=FILE/x cannot be written: FILE is not a folder",
+}
+"""What is wrong with the arguments of scripts, and how it is told."""
+
+
+def test_bad_arguments_are_one_line_before_any_work(loaded: LoadedProcess, tmp_path: Path) -> None:
+    places = {name: str(tmp_path / name.lower()) for name in ("FILE", "OLD", "NEW", "PADS")}
+    Path(places["FILE"]).write_text("mine")
+    (Path(places["OLD"]) / "pretrained_model").mkdir(parents=True)
+    write_template(Path(places["PADS"]))
+
+    def placed(text: str) -> str:
+        for name, path in places.items():
+            text = text.replace(name, path)
+        return text
+
+    calls = []
+    for line in BAD:
+        name, *arguments = placed(line).split()
+        calls.append([str(SCRIPTS / f"{name}.py"), *arguments])
+    done = loaded.run(COMPLAIN, json.dumps(calls), *map(str, (SCRIPTS, ROOT)), cwd=ROOT)
+    assert done.returncode == 0, done.stderr[-2000:]
+    found = json.loads(done.stdout.strip().splitlines()[-1])
+    for (line, wanted), (status, told) in zip(BAD.items(), found, strict=True):
+        assert (status, told.count("\n")) == (2, 1), (line, told)
+        assert told.startswith(f"error: {placed(wanted)}"), (line, told)
+    assert Path(places["FILE"]).read_text() == "mine"
 
 
 @pytest.fixture(scope="module")

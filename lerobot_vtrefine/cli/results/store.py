@@ -9,6 +9,7 @@ from contextlib import contextmanager
 from dataclasses import replace as replace_fields
 from pathlib import Path
 
+from lerobot_vtrefine.cli.outputs import check_file
 from lerobot_vtrefine.cli.results.rows import Progress, Row, Run, merge, read_rows, write_rows
 
 CURVE_COLUMNS = ("iteration", "env_steps", "success", "eval_success", "seconds", "actor_lr", "decision_kl")
@@ -23,6 +24,17 @@ def save(path: Path, found: list[tuple[Row, Progress]], *, replace: bool) -> Non
     path.parent.mkdir(parents=True, exist_ok=True)
     with only_one_in(path.parent):
         _save(path, found, replace)
+
+
+def check_results(flag: str, path: Path) -> None:
+    """Raise, before hours of work for a row of it, where `save` could not put one into this file.
+
+    Raises:
+        OSError: it cannot be written. ValueError: it holds no rows; names it.
+    """
+    check_file(flag, path)
+    if path.is_file():
+        read_rows(path)
 
 
 @contextmanager
