@@ -14,6 +14,7 @@ from pathlib import Path
 
 from lerobot_vtrefine.cli.arguments import CommandParser, ListAction
 from lerobot_vtrefine.cli.errors import run_cli
+from lerobot_vtrefine.cli.outputs import check_folder
 from lerobot_vtrefine.drivers.diagnostic_emulator import DiagnosticEmulator
 from lerobot_vtrefine.drivers.emulator import ENCODERS, LONGEST_S, Faults, PadEmulator
 from lerobot_vtrefine.drivers.frames import FrameShape
@@ -130,7 +131,10 @@ def parse_faults(options: argparse.Namespace) -> Faults:
         "unplug_at_s": options.unplug_at,
         "replug_after_s": options.replug_after,
     }
-    return decode(Faults, faults, "faults", "fault ")
+    found = decode(Faults, faults, "faults", "fault ")
+    if options.protocol == "diagnostic" and found != Faults(stall_s=found.stall_s):
+        raise ValueError("--protocol=diagnostic has no faults: leave out --loss and what is listed with it")
+    return found
 
 
 def parse_shape(text: str) -> FrameShape:
@@ -231,6 +235,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     faults = parse_faults(options)
     names = NAMES if options.boards <= len(NAMES) else tuple(f"pad_{i}" for i in range(options.boards))
     turns = Turns()
+    given = {"--arms": options.arms, "--folder": options.folder}
+    places = {path.resolve(): (flag, path) for flag, path in given.items() if path}
     with ExitStack() as stack:
         if threading.current_thread() is threading.main_thread():  # a killed emulator removes its ports, too
             before = signal.signal(signal.SIGTERM, signal.default_int_handler)
@@ -239,7 +245,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
             make_board(options, shape, faults, board, name, turns)
             for board, name in enumerate(names[: options.boards])
         ]
-        for folder in {path.resolve(): path for path in (options.folder, options.arms) if path}.values():
+        for flag, folder in places.values():
+            check_folder(flag, folder)
             claim(folder, stack)
         for emulator in boards:
             print(stack.enter_context(emulator).port, flush=True)

@@ -1,5 +1,6 @@
 """ALOHA's four arms on pseudo-terminals, with calibration files: LeRobot's commands without hardware."""
 
+import errno
 import json
 import math
 from contextlib import ExitStack
@@ -68,7 +69,11 @@ class AlohaEmulator:
         self.calibration_dir.mkdir(parents=True, exist_ok=True)
         for who, model in ARMS.items():
             path = self.calibration_dir / f"{who}.json"
-            path.write_text(json.dumps(arm_calibration(model)), encoding="utf-8")
+            text = json.dumps(arm_calibration(model))
+            if path.exists() and path.read_text(encoding="utf-8") != text:
+                reason = "this is the calibration of other arms; choose another folder"
+                raise FileExistsError(errno.EEXIST, reason, str(path))
+            path.write_text(text, encoding="utf-8")
         with ExitStack() as stack:
             for bus in self.buses.values():
                 stack.enter_context(bus)

@@ -1,5 +1,6 @@
 """Pseudo-terminals under a name of their own: what emulated hardware is plugged into. Linux and macOS."""
 
+import errno
 import os
 import tty
 from pathlib import Path
@@ -9,8 +10,15 @@ Terminal = tuple[int, int]
 
 
 def plug_in(link: Path) -> Terminal:
-    """Open a raw pseudo-terminal that `link` names."""
+    """Open a raw pseudo-terminal that `link` names, as an earlier one may have done.
+
+    Raises:
+        FileExistsError: a file or a folder is there, which is somebody's.
+    """
     link.parent.mkdir(parents=True, exist_ok=True)
+    if link.exists() and not link.is_symlink():
+        reason = "this is not the port of an emulator; remove it, or choose another folder"
+        raise FileExistsError(errno.EEXIST, reason, str(link))
     link.unlink(missing_ok=True)
     hardware, reader = os.openpty()
     try:

@@ -87,3 +87,47 @@ def test_wrong_size_on_request(tmp_path: Path) -> None:
         pytest.raises(PortError, match=wrong),
     ):
         PadReader(config).connect(timeout_s=1.0)
+
+
+@pytest.mark.parametrize(
+    ("flags", "told"),
+    [
+        (["--folder=FILE"], "--folder=FILE is a file; name a folder"),
+        (["--folder=FILE/pads"], "--folder=FILE/pads cannot be written: FILE/pads is not a folder"),
+        (["--arms=FILE"], "--arms=FILE is a file; name a folder"),
+        (
+            ["--protocol=diagnostic", "--loss=0.5"],
+            "--protocol=diagnostic has no faults: leave out --loss and",
+        ),
+    ],
+)
+def test_bad_flags_are_one_line(flags, told: str, tmp_path: Path, capsys) -> None:
+    file = tmp_path / "file"
+    file.write_text("mine")
+    given = [flag.replace("FILE", str(file)) for flag in flags]
+    assert pad_emulator([f"--folder={tmp_path / 'pads'}", "--seconds=0.1", *given]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith(f"error: {told.replace('FILE', str(file))}")
+    assert error.count("\n") == 1
+
+
+def test_what_is_no_port_is_left_alone(tmp_path: Path, capsys) -> None:
+    taken = tmp_path / "pads" / NAME
+    taken.parent.mkdir()
+    taken.write_text("mine")
+    flags = [f"--folder={taken.parent}", "--seconds=0.1"]
+    assert pad_emulator(flags) == 2
+    told = "this is not the port of an emulator; remove it, or choose another folder"
+    assert capsys.readouterr().err == f"error: {told}: {taken}\n"
+    assert taken.read_text() == "mine"
+    taken.unlink()
+    taken.symlink_to("/dev/pts/gone")  # as a killed emulator leaves it
+    assert pad_emulator(flags) == 0
+    calibration = tmp_path / "arms" / "calibration" / "follower.json"
+    calibration.parent.mkdir(parents=True)
+    calibration.write_text("{}")
+    assert pad_emulator([*flags, f"--arms={tmp_path / 'arms'}"]) == 2
+    assert f"this is the calibration of other arms; choose another folder: {calibration}" in (
+        capsys.readouterr().err
+    )
+    assert calibration.read_text() == "{}"
