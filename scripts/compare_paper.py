@@ -37,7 +37,7 @@ from paper.stages import TASKS, shared_stages, stages
 from paper.trained import PAPERS_OWN, Trained, chosen, table_of, variants
 from runs.side_by_side import run_all
 
-from lerobot_vtrefine.cli.arguments import CommandParser
+from lerobot_vtrefine.cli.arguments import CommandParser, at_least
 from lerobot_vtrefine.cli.errors import run_cli
 from lerobot_vtrefine.cli.pipeline.demo_config import RECIPES
 from lerobot_vtrefine.cli.pipeline.stages import StageRunner
@@ -70,18 +70,24 @@ def make_parser() -> CommandParser:
         help="of --recipe=pads; {pair} stands for the pair's number (default: what comes with the package for"
         " the pair; own: one trained here)",
     )
-    parser.add_argument("--encoder_episodes", type=int, default=4096, help="that an encoder learns from")
-    parser.add_argument("--encoder_steps", type=int, default=4000, help="of an encoder's training")
-    parser.add_argument("--steps", type=int, default=6000, help="of imitation")
-    parser.add_argument("--batch_size", type=int, default=128, help="of imitation (default %(default)s)")
-    parser.add_argument("--iterations", type=int, default=14, help="of DPPO (default %(default)s)")
-    parser.add_argument("--scratch_iterations", type=int, default=20, help="of DPPO without pre-training")
-    parser.add_argument("--worlds", type=int, default=1024, help="of DPPO (default %(default)s)")
+    parser.add_argument(
+        "--encoder_episodes", type=at_least(1), default=4096, help="that an encoder learns from"
+    )
+    parser.add_argument("--encoder_steps", type=at_least(1), default=4000, help="of an encoder's training")
+    parser.add_argument("--steps", type=at_least(1), default=6000, help="of imitation")
+    parser.add_argument(
+        "--batch_size", type=at_least(1), default=128, help="of imitation (default %(default)s)"
+    )
+    parser.add_argument("--iterations", type=at_least(1), default=14, help="of DPPO (default %(default)s)")
+    parser.add_argument(
+        "--scratch_iterations", type=at_least(1), default=20, help="of DPPO without pre-training"
+    )
+    parser.add_argument("--worlds", type=at_least(1), default=1024, help="of DPPO (default %(default)s)")
     parser.add_argument("--tune_start", choices=["table", "bank", "grasped"], default="table", help="of DPPO")
     parser.add_argument("--tune_steps", type=int, help="control step at which episodes from a bank end")
     parser.add_argument("--tune_timestep_s", type=float, help="longest physics step [s] of DPPO")
-    parser.add_argument("--starts", type=int, default=512, help="states in a bank")
-    parser.add_argument("--episodes", type=int, default=512, help="of an evaluation")
+    parser.add_argument("--starts", type=at_least(1), default=512, help="states in a bank")
+    parser.add_argument("--episodes", type=at_least(1), default=512, help="of an evaluation")
     parser.add_argument("--eval_envs", type=int, default=512, help="episodes evaluated at once")
     parser.add_argument("--demo_envs", type=int, default=16, help="episodes recorded at once")
     for name, words in (("env", "environment"), ("policy", "policy"), ("dppo", "update")):
@@ -90,7 +96,7 @@ def make_parser() -> CommandParser:
         )
     parser.add_argument("--device", default="cuda", help="of the networks")
     parser.add_argument("--backend", choices=["batch", "warp"], help="default: warp on cuda, else batch")
-    parser.add_argument("--jobs", type=int, default=1, help="policies side by side (default 1)")
+    parser.add_argument("--jobs", type=at_least(1), default=1, help="policies side by side (default 1)")
     parser.add_argument("--commit", help="of the code, where no checkout tells it")
     parser.add_argument(
         "--output_dir",

@@ -18,7 +18,7 @@ from pathlib import Path
 
 from runs.side_by_side import run_all
 
-from lerobot_vtrefine.cli.arguments import CommandParser
+from lerobot_vtrefine.cli.arguments import CommandParser, at_least
 from lerobot_vtrefine.cli.errors import run_cli
 from lerobot_vtrefine.cli.pipeline.demo_config import EVAL_SEED_OFFSET
 from lerobot_vtrefine.cli.pipeline.stages import Stage, StageRunner, evaluation_stage, trained_policy
@@ -130,17 +130,19 @@ def make_parser() -> CommandParser:
         "--policies", nargs="+", choices=list(POLICIES), default=list(POLICIES), help="default: all"
     )
     parser.add_argument("--task", default="round_grasped", help="a file of configs/env (default %(default)s)")
-    parser.add_argument("--num_demos", type=int, default=200, help="default %(default)s")
-    parser.add_argument("--steps", type=int, default=5000, help="of training (default %(default)s)")
-    parser.add_argument("--batch_size", type=int, default=64, help="default %(default)s")
-    parser.add_argument("--episodes", type=int, default=500, help="of an evaluation (default %(default)s)")
+    parser.add_argument("--num_demos", type=at_least(1), default=200, help="default %(default)s")
+    parser.add_argument("--steps", type=at_least(1), default=5000, help="of training (default %(default)s)")
+    parser.add_argument("--batch_size", type=at_least(1), default=64, help="default %(default)s")
+    parser.add_argument(
+        "--episodes", type=at_least(1), default=500, help="of an evaluation (default %(default)s)"
+    )
     parser.add_argument(
         "--device", default="cuda", help="of the networks: cpu or cuda (default: %(default)s)"
     )
     parser.add_argument("--backend", choices=["batch", "warp"], default="batch", help="of the evaluation")
-    parser.add_argument("--eval_envs", type=int, default=50, help="episodes evaluated at once")
+    parser.add_argument("--eval_envs", type=at_least(1), default=50, help="episodes evaluated at once")
     parser.add_argument("--workers", type=int, default=0, help="processes that record (default none)")
-    parser.add_argument("--jobs", type=int, default=1, help="policies side by side (default 1)")
+    parser.add_argument("--jobs", type=at_least(1), default=1, help="policies side by side (default 1)")
     parser.add_argument("--commit", help="of the code, where no checkout tells it")
     parser.add_argument(
         "--output_dir",

@@ -30,6 +30,7 @@ from reality.telling import as_text
 from runs.comparison import save
 from runs.side_by_side import run_all
 
+from lerobot_vtrefine.choices import check_choice
 from lerobot_vtrefine.cli.arguments import CommandParser
 from lerobot_vtrefine.cli.errors import run_cli
 from lerobot_vtrefine.cli.pipeline.demo_config import RECIPES, default_degradation
@@ -104,6 +105,7 @@ def main() -> None:
     check_device(budget.device)
     before, policies = lanes(budget)
     if options.lane is not None:
+        check_choice("--lane", options.lane, before | policies)
         StageRunner(budget.output_dir, (before | policies)[options.lane]).run()
         return
     write_worlds(budget)

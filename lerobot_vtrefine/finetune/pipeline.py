@@ -216,7 +216,7 @@ def env_on(
     """
     env = env_of(task)
     backend = backend or (env.backend if device == "cpu" else "warp")
-    scene = replace(env.scene, timestep_s=timestep_s or env.scene.timestep_s)
+    scene = env.scene if timestep_s is None else replace(env.scene, timestep_s=timestep_s)
     return replace(env, backend=backend, warp=replace(env.warp, device=device), scene=scene, **fields)
 
 

@@ -26,3 +26,13 @@ def test_flags_are_named_as_they_are_given(
     assert main() == 2
     told = "--effort.episodes=4 must be at least twice --effort.num_envs=4"
     assert told in capsys.readouterr().err
+
+
+def test_an_unknown_device_is_told_before_the_study(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    flags = [f"--output_dir={tmp_path / 'out'}", "--effort.device=tpu"]
+    monkeypatch.setattr("sys.argv", ["vtrefine-information", *flags])
+    assert main() == 2
+    assert "error: --effort.device=tpu is unknown; give cpu or cuda" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []

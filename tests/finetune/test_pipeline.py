@@ -327,6 +327,12 @@ def test_bad_input_is_one_clear_line(finetune, tmp_path, capsys):
     damaged = save_tiny_checkpoint(tmp_path / "damaged")
     (damaged / "config.json").write_text("{")
     assert f"{damaged}: config.json is not valid JSON" in complaint(policy=damaged)
+    (damaged / "config.json").write_text("[]")
+    assert f"{damaged}: config.json does not hold settings by name" in complaint(policy=damaged)
+    folder = save_tiny_checkpoint(tmp_path / "folder")
+    (folder / "model.safetensors").unlink()
+    (folder / "model.safetensors").mkdir()
+    assert f"{folder}/model.safetensors is a folder; copy the checkpoint again" in complaint(policy=folder)
     other = "--env.scene.embodiment=kinova"
     assert f"{other}, but the policy is of aloha: name an environment" in complaint(other)
 
