@@ -133,12 +133,9 @@ class VtDp3Policy(PreTrainedPolicy):
         path = Path(pretrained_name_or_path)
         if path.is_dir() and not (path / "config.json").is_file():
             raise FileNotFoundError(f"{path} holds no policy; give the checkpoint's pretrained_model folder")
-        if (
-            path / SAFETENSORS_SINGLE_FILE
-        ).is_dir():  # of which the reader tells no more than "No such device"
-            raise IsADirectoryError(
-                f"{path / SAFETENSORS_SINGLE_FILE} is a folder; copy the checkpoint again"
-            )
+        weights = path / SAFETENSORS_SINGLE_FILE
+        if weights.is_dir():  # the reader would say "No such device"
+            raise IsADirectoryError(f"{weights} is a folder; copy the checkpoint again")
         try:
             policy = super().from_pretrained(pretrained_name_or_path, read_encoder=False, **kwargs)
         except SafetensorError as error:
