@@ -63,6 +63,6 @@ def test_it_clones_and_leaves_a_policy_with_its_processors(arguments, monkeypatc
 
 
 def test_an_encoder_that_is_trained_is_refused(arguments):
-    arguments.policy = '{"freeze_encoder": false}'
+    arguments.policy = {"freeze_encoder": False}
     with pytest.raises(ValueError, match="freeze_encoder"):
         script.load(arguments)
