@@ -11,9 +11,9 @@ import bench_jittered
 def test_every_set_has_a_specimen_of_its_own() -> None:
     args = Namespace(
         laws=",".join([bench_jittered.CLEAN, *bench_jittered.jittered_rig.EFFECTS]),
-        gains="0.2,0.4",
-        seeds="5:7",
-        pad="12x32",
+        gains=[0.2, 0.4],
+        seeds=(5, 7),
+        pad=(12, 32),
     )
     sets = bench_jittered.chosen(args).values()
     assert len({bench_jittered.specimen(law, gain, seed) for law, gain, seed, *_ in sets}) == len(sets)
